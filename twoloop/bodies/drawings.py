@@ -55,12 +55,6 @@ class Sketch:
         if bar[0] != bar[1] and bar not in self.bars:
             self.bars.append(bar)
 
-    def add_box(self, body: int, size: Any) -> None:
-        """Add a box, or a rectangle, about the centre of a body; edges of length zero are left out."""
-        corners, edges = box(size)
-        for i, j in edges:
-            self.line((body, corners[i]), (body, corners[j]))
-
     def add_body(self, body: int, points: Sequence[Any], far: float, size: Any) -> None:
         """Add lines between the points of a body; a single off-centre point is extended to `far` times; none: a box."""
         places = [np.asarray(point, dtype=float) for point in points]
@@ -68,7 +62,9 @@ class Sketch:
             places.append(far * places[0])
             self.trace(body, places[1])
         if len(places) < 2:
-            self.add_box(body, size)
+            corners, edges = box(size)
+            for i, j in edges:  # `line` leaves out edges of length zero
+                self.line((body, corners[i]), (body, corners[j]))
         for first, second in pairwise(places):
             self.line((body, first), (body, second))
 

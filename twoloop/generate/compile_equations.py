@@ -398,7 +398,11 @@ class SharedCode:
         self.equations, self.cache, self.numbers, self.split_functions = equations, cache, Coefficients(), None
         if equations.n_operations > (SPLIT_ALL if equations.reduced_program is None else SPLIT_PROJECTIONS):
             self.split_functions = SplitFunctions(equations, self.numbers)
-        self.programs = self._programs()
+        # the programs of the functions that are not split into parts, by names of the functions
+        self.programs = {"own_redundant": equations.redundant_rows}
+        if self.split_functions is None:
+            self.programs["own_correct_positions"] = equations.position_projection
+            self.programs["own_project"] = equations.projection
         structure = repr(list(self._structure()))
         self.digest = hashlib.sha256((structure + _stamp()).encode()).hexdigest()
         # optimization passes of LLVM do not make the code faster, and take up to a quarter of the time to compile
@@ -409,14 +413,6 @@ class SharedCode:
         return GeneratedCode(
             self, evaluate(self.numbers.formulas), self.equations.traced.specialize(system, evaluate), evaluate
         )
-
-    def _programs(self) -> dict[str, Program]:
-        """Return the programs of the functions that are not split into parts, by names of the functions."""
-        equations = self.equations
-        programs = {"own_redundant": equations.redundant_rows}
-        if self.split_functions is None:
-            programs |= {"own_correct_positions": equations.position_projection, "own_project": equations.projection}
-        return programs
 
     def _structure(self) -> Iterable[Any]:
         equations, parts, numbers = self.equations, self.split_functions, self.numbers

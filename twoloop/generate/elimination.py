@@ -568,22 +568,17 @@ class FactorAndSolvePrograms:
         self._rows = {k: [to_new_graph(x) for x in equations.all_rows[k]] for k in used}
         self._mass = [[to_new_graph(x) for x in row] for row in mass] if refined else []
         self._zero = Affine(self.graph, 0.0, {})
-        self.solution_program = self._make_solution_program()
+        self._solve = partial(solve, self._blocks)
+        lam = [self._zero] * len(self._c)
+        solution, conditions = solve_refined(self._solve, self._choice, self._mass, self._rows, self._r, self._c)
+        for k, value in zip(rows, solution[self._n :], strict=True):
+            lam[k] = value
+        self.solution_program = Program(self.graph, {"a": solution[: self._n], "lam": lam}, conditions)
 
     @property
     def n_stored(self) -> int:
         """Return the number of stored quantities."""
         return len(self.stored_indices)
-
-    def _solve(self, rhs: Sequence[Affine]) -> list[Affine]:
-        return solve(self._blocks, rhs)
-
-    def _make_solution_program(self) -> Program:
-        lam = [self._zero] * len(self._c)
-        solution, conditions = solve_refined(self._solve, self._choice, self._mass, self._rows, self._r, self._c)
-        for k, value in zip(self._choice.rows, solution[self._n :], strict=True):
-            lam[k] = value
-        return Program(self.graph, {"a": solution[: self._n], "lam": lam}, conditions)
 
     @cached_property
     def least_norm_program(self) -> Program:

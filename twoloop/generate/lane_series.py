@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 from twoloop.generate.elimination import FactorAndSolvePrograms
 from twoloop.generate.llvm_code import FUNCTIONS, INTRINSICS, Emitter, Quantities, lower_program, sine_and_cosine
-from twoloop.generate.llvm_text import INTEGER, Builder, Value, integer, undefined
+from twoloop.generate.llvm_text import DOUBLE, INTEGER, Builder, Value, integer, undefined, vector_of
 from twoloop.generate.program import Coefficient, Coefficients, Terms
 from twoloop.generate.series import OperationGroups, SeriesProgram, Sums
 from twoloop.kernels.data.collocation import LANES as STAGES
@@ -101,13 +101,19 @@ class LaneEmitter(Emitter):
 
 
 def load_lanes(emit: LaneEmitter, base: Value, index: int = 0) -> Value:
-    """Return the vector base[index : index + STAGES]: one number for each stage of a collocation step."""
-    return Emitter(emit.builder).load_vector(base, index, STAGES)
+    """Return the vector base[index : index + STAGES]: one number for each stage of a collocation step.
+
+    Its address must be aligned to the size of the vector. This is slow if the elements have just been stored one by
+    one: the processor waits until all are stored.
+    """
+    start, kind = emit.builder.advance(base, integer(index)), vector_of(DOUBLE, STAGES)
+    return emit.builder.load(emit.builder.convert("bitcast", start, f"{kind}*"), 8 * STAGES)
 
 
 def store_lanes(emit: LaneEmitter, value: Value, base: Value, index: int = 0) -> None:
     """Store a vector in base[index : index + STAGES]: one number for each stage of a collocation step."""
-    Emitter(emit.builder).store_vector(value, base, index)
+    pointer = emit.builder.convert("bitcast", emit.builder.advance(base, integer(index)), f"{value.type}*")
+    emit.builder.store(value, pointer, 8 * STAGES)
 
 
 def two_sums(emit: LaneEmitter, a: Value, b: Value) -> list[Value]:

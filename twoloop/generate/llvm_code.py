@@ -26,7 +26,6 @@ from twoloop.generate.llvm_text import (
     integer,
     undefined,
     vector_of,
-    width_of,
 )
 from twoloop.generate.program import Algebra, Coefficient, Coefficients, Program, Terms
 from twoloop.kernels.evaluation.operations import (
@@ -149,19 +148,6 @@ class Emitter:
     def store(self, value: Value, base: Value, index: int = 0) -> None:
         """Store a number in base[index]."""
         self.builder.store(value, self._entry_pointer(base, index))
-
-    def load_vector(self, base: Value, index: int, width: int) -> Value:
-        """Return the vector that begins at base[index]; this address must be aligned to the size of the vector.
-
-        This is slow if the elements have just been stored one by one: the processor waits until all are stored.
-        """
-        pointer = self.builder.convert("bitcast", self.pointer(base, index), f"{vector_of(DOUBLE, width)}*")
-        return self.builder.load(pointer, 8 * width)
-
-    def store_vector(self, value: Value, base: Value, index: int) -> None:
-        """Store a vector that begins at base[index]; this address must be aligned to the size of the vector."""
-        pointer = self.builder.convert("bitcast", self.pointer(base, index), f"{value.type}*")
-        self.builder.store(value, pointer, 8 * width_of(value.type))
 
     def vector(self, values: Sequence[Value]) -> Value:
         """Return the vector whose elements are `values`."""

@@ -325,11 +325,10 @@ class Equations:
         """Return C_q, C_t or gamma as derivatives of other callbacks, even if there is a callback for it."""
         if kind == "jacobian":
             return self._jacobian()
-        return (
-            self._constraint_rate()
-            if kind == "constraint_rate"
-            else self._gamma(*GAMMA_SOURCES[kind], self.v if v is None else v)
-        )
+        if kind == "constraint_rate":
+            time_derivative = Derivative(self.graph, {only_quantity(self.t): Affine(self.graph, 1.0, {})})
+            return symbol_array(time_derivative.differentiate(expr) for expr in self.expressions("constraint"))
+        return self._gamma(*GAMMA_SOURCES[kind], self.v if v is None else v)
 
     def _derive_or_trace(self, kind: str, v: Sequence[Affine]) -> Any:
         """Return derivatives for C_q or gamma if there is no callback for it; for other callbacks, the trace."""
@@ -375,11 +374,6 @@ class Equations:
             derivative = Derivative(self.graph, {only_quantity(coordinate): unit})
             jacobian[:, j] = [derivative.differentiate(expr) for expr in constraint]
         return jacobian
-
-    def _constraint_rate(self) -> Any:
-        constraint, unit = self.expressions("constraint"), Affine(self.graph, 1.0, {})
-        time_derivative = Derivative(self.graph, {only_quantity(self.t): unit})
-        return symbol_array(time_derivative.differentiate(expr) for expr in constraint)
 
     def _gamma(self, rows: str, rates: str, v: Sequence[Affine]) -> Any:
         """Return -d/dt(G v + r) at constant v; `rows`, `rates`: callbacks for G and r (C_q and C_t, or A and b)."""

@@ -469,7 +469,8 @@ class Motion:
         if self.deadline < np.inf:
             options["time_limit"] = max(self.deadline - time.monotonic(), MIN_TIME_LIMIT)
         if resting:  # the callbacks of an extended system call other callbacks, and cannot be traced
-            options |= options_without_traces(options)
+            needs_traces = isinstance(check_method(options["method"]), Taylor | Lobatto16)
+            options |= {"method": PRESETS["auto"] if needs_traces else options["method"], "compiled": False}
         arc = solve_dae(system, (self.t, t1), self.q, self.v, events=events, dense_output=True, **options)
         self.arcs.append(arc)
         ended = {k for k in range(len(events)) if arc.t_events is not None and arc.t_events[k].size}
@@ -565,12 +566,6 @@ class Motion:
             return float(margin * available - abs(needed))
 
         return reserve
-
-
-def options_without_traces(options: dict[str, Any]) -> dict[str, Any]:
-    """Return changed options, `method` and `compiled`, for arcs with closed stops: their callbacks cannot be traced."""
-    method = PRESETS["auto"] if isinstance(check_method(options["method"]), Taylor | Lobatto16) else options["method"]
-    return {"method": method, "compiled": False}
 
 
 def make_terminal(event: Any) -> Any:
