@@ -14,7 +14,7 @@ from twoloop.kernels.data.indices import N_COUNTERS, N_NOTES
 from twoloop.kernels.linalg.band import N_ROUTINES
 from twoloop.kernels.linalg.markowitz_lu import MAX_ENTRIES_PER_LINE, N_COUNTS, N_LISTS, index_size, values_size
 
-# largest number of unused workspaces that are kept for later runs, and of floats in such a workspace
+# largest number of unused workspaces that are kept for later runs; a workspace with more floats is not kept
 MAX_UNUSED, MAX_UNUSED_SIZE = 32, 100_000
 WORD, LINE = 8, 8  # bytes in a number; numbers in a cache line: each array begins at the start of a cache line
 
@@ -25,12 +25,13 @@ class FixedOrderSizes(NamedTuple):
     n_factors: int
     n_mass_values: int
     n_jacobian_values: int
-    dense_mass: bool  # whether the entries of a varying M are copied from a full matrix, which a callback fills
-    dense_jacobian: bool  # whether the entries of C_q are copied from a full matrix, which a callback fills
+    dense_mass: bool  # True: M varies, and its entries are copied from a full matrix, which a callback fills
+    dense_jacobian: bool  # True: the entries of C_q are copied from a full matrix, which a callback fills
 
 
-# arguments of _create_layout: n_q; n_c; n_a; ranks of C_q and of [C_q; A]; whether T^T M T is used, and whether the
-# augmented matrix; number of nodes of traced programs; sizes of the fixed-order form, or None; length of `matrices`
+# arguments of _create_layout: numbers of coordinates, of constraints, of non-holonomic constraints; rank of the first
+# and of all constraints; True if accelerations follow from T^T M T (T: null space of the constraints); True if they
+# follow from the augmented matrix; number of nodes of traced programs; FixedOrderSizes or None; length of `matrices`
 Sizes = tuple[int, int, int, int, int, bool, bool, int, FixedOrderSizes | None, int]
 ArrayRanges = list[tuple[str, int, int, tuple[int, ...]]]  # for each array: name, first offset, end, shape
 
@@ -38,9 +39,9 @@ ArrayRanges = list[tuple[str, int, int, tuple[int, ...]]]  # for each array: nam
 class Layout(NamedTuple):
     """Offsets of the arrays of a workspace, which consists of a block of floats and a block of integers.
 
-    The table of addresses and shapes of a workspace is `table` + `of_numbers` * (address of the floats) + `of_integers`
-    * (address of the integers). The first `n_lasting` floats and `n_lasting_integers` integers keep data from one step
-    to the next; a step fills all other numbers before it reads them.
+    A workspace passes a table of the addresses and shapes of its arrays to kernels. This is `table` + `of_numbers` *
+    (address of the floats) + `of_integers` * (address of the integers). The first `n_lasting` floats and
+    `n_lasting_integers` integers keep data from one step to the next; a step fills all others before it reads them.
     """
 
     numbers: ArrayRanges
@@ -55,7 +56,7 @@ class Layout(NamedTuple):
 
 
 def empty_workspace(sizes: Sizes) -> Work:
-    """Return a workspace of `sizes` in its initial state: one that a previous run left, or a new one."""
+    """Return a workspace of `sizes` in its initial state: a new one, or one that a previous run no longer needs."""
     unused = _take_unused_workspace(sizes)
     return _allocate_workspace(sizes) if unused is None else reset_workspace(unused)
 
@@ -95,11 +96,11 @@ def _allocate_workspace(sizes: Sizes) -> Work:
 
 
 def keep_unused_workspace(work: Work) -> None:
-    """Keep an unused workspace, unless it is large, for later runs of equal sizes; keep at most MAX_UNUSED."""
+    """Keep an unused workspace, unless it is large, for later runs of equal sizes; discard old ones over MAX_UNUSED."""
     unused = _unused_workspaces.pop(work.sizes, [])
     if work.notes.base.size <= MAX_UNUSED_SIZE and len(unused) < MAX_UNUSED:
         unused.append(work)
-    # insert at the end of the dictionary, which then begins with the sizes that were used longest ago
+    # insert these sizes at the end of the dictionary: so it begins with the sizes that were used longest ago
     _unused_workspaces[work.sizes] = unused
     for oldest in list(_unused_workspaces)[:-1]:
         if sum(map(len, list(_unused_workspaces.values()))) <= MAX_UNUSED:
@@ -107,7 +108,7 @@ def keep_unused_workspace(work: Work) -> None:
         _unused_workspaces.pop(oldest, None)
 
 
-_unused_workspaces: dict[Sizes, list[Work]] = {}  # unused workspaces, in a list for each combination of sizes
+_unused_workspaces: dict[Sizes, list[Work]] = {}  # for each combination of sizes, the list of unused workspaces
 
 
 def reset_workspace(work: Work) -> Work:
@@ -127,7 +128,7 @@ def cached_run() -> Any:
 
 
 def _fixed_order_shapes(n_q: int, n_c: int, rank: int, form: FixedOrderSizes) -> tuple[dict[str, tuple[int, ...]], ...]:
-    """Return the shapes, by name, of the arrays of floats and of integers that differ in the fixed-order form.
+    """Return two dictionaries with the shapes of arrays (floats; integers) that the fixed-order form changes.
 
     The fixed-order form has no partition: all coordinates count as independent, and also as dependent, because steps
     compare all predicted positions with the positions on the constraints.
@@ -232,7 +233,7 @@ def _create_layout(
         integers |= fixed_order_shapes[1]
         rows_of_G, mass_side = (n_rows + 1) * fixed_order.dense_jacobian, n_q * fixed_order.dense_mass
         n_entries = rows_of_G * n_q
-    # without non-holonomic constraints, these arrays for positions also serve for velocities
+    # without non-holonomic constraints, the arrays for positions also serve for velocities (names that end in _v)
     of_positions = {name for name in integers if n_a == 0 and f"{name}_v" in integers}
     for name in of_positions:
         del integers[f"{name}_v"]
@@ -242,7 +243,7 @@ def _create_layout(
     of_integers, n_integers = _array_ranges(integers)
     of_numbers["entries"], of_numbers["G"] = (0, n_entries, (n_entries,)), (0, n_entries, (rows_of_G, n_q))
     of_numbers["M"] = n_entries, n_entries + mass_side * mass_side, (mass_side, mass_side)
-    # number of integers at the end of `index` that are scratch for choosing an elimination order, and need not be kept
+    # the last integers of `index` are scratch for the choice of an elimination order, and keep no data between steps
     n_ordering = (N_COUNTS + N_LISTS * min(r, MAX_ENTRIES_PER_LINE)) * r if fixed_order is None else 0
     n_lasting = of_numbers["matrices"][0], of_integers["index"][1] - n_ordering
     if n_a == 0:
@@ -260,7 +261,7 @@ def _create_layout(
 
 
 def _array_ranges(shapes: Mapping[str, tuple[int, ...]]) -> tuple[dict[str, tuple[int, int, tuple[int, ...]]], int]:
-    """Return (first offset, end, shape) of each array by name, aligned to cache lines, and the total length."""
+    """Return the first offset, end and shape of each array, by name, and the total length; align to cache lines."""
     ranges, end = {}, 0
     for name, shape in shapes.items():
         size = math.prod(shape)

@@ -1,9 +1,10 @@
 """Project initial states in lanes onto the constraints by the least change; check whether another assembly is as near.
 
-The least change follows from the Cholesky factor of G G^T, with the rows of G scaled to norm 1. Redundant rows are
-linearly dependent at positions that satisfy the constraints, and nearly dependent at others. The rows of Z are
-eigenvectors of G G^T: combinations of rows of G that vanish if the constraints hold. Components of right-hand sides
-along the rows of Z are removed, and Z^T Z is added to G G^T, so that the sum is not singular. Lanes are independent.
+G is the constraint Jacobian C_q with rows scaled to norm 1; the least change follows from the Cholesky factor of G G^T.
+If constraints are redundant, rows of G are dependent at positions that satisfy the constraints, and nearly dependent at
+others. Each row of Z contains the coefficients of a combination of rows of G that vanishes if the constraints hold, an
+eigenvector of G G^T. Components of right-hand sides along these are removed, and Z^T Z is added to G G^T, so that the
+sum is not singular. Lanes are independent.
 
 `pattern` is the sparsity pattern of G. Its first n_rows + 1 entries are indices in `pattern`: the columns of row i are
 the entries from pattern[i] to pattern[i + 1] - 1. Matrices and vectors in `work` are given by offsets, in vectors.
@@ -19,18 +20,17 @@ from twoloop.kernels.data.common import INTEGERS, KIT, compiled, kernel, merged
 from twoloop.kernels.lanes import layout as at
 from twoloop.kernels.lanes.layout import CODE, LANES, copy_vectors, fill_field, offsets_in_work
 
+# G: constraint Jacobian with rows scaled to norm 1; Z: combinations of its rows that vanish, eigenvectors of G G^T
 DIAGONAL_SHIFT = 1e-15  # added to the diagonal of G G^T, so that the matrix is not singular
-ITERATION_SHIFT = 1e-8  # replaces DIAGONAL_SHIFT in inverse iterations, because some eigenvalues of G G^T are zero then
-MAX_REDUNDANT_EIGENVALUE = 1e-4  # an eigenvector of G G^T counts as a redundant combination up to this eigenvalue
-# number of inverse iterations for each row of Z: few suffice, because redundant combinations have tiny eigenvalues
-N_REDUNDANT_ITERATIONS = 5
-# inverse iterations start from irregular numbers: multiples of this number, modulo 1
-GOLDEN_SECTION = 0.6180339887498949
+ITERATION_SHIFT = 1e-8  # the same in inverse iterations for Z; larger, because eigenvalues of G G^T are zero then
+MAX_REDUNDANT_EIGENVALUE = 1e-4  # eigenvectors of G G^T with larger eigenvalues are not combinations that vanish
+N_REDUNDANT_ITERATIONS = 5  # inverse iterations for each row of Z; few suffice, because its eigenvalue is tiny
+GOLDEN_SECTION = 0.6180339887498949  # inverse iterations start from irregular numbers: multiples of this one, modulo 1
 
 
 @merged
 def _subtract_in_four_lanes(work, target, x, x_stride, y, y_stride, count):
-    """In four adjacent lanes, subtract `count` products work[x] * work[y] from work[target]; x and y have strides."""
+    """Subtract products work[x] * work[y], with strides of x and y, from work[target]; also in the next three lanes."""
     t0, t1, t2, t3 = work[target], work[target + 1], work[target + 2], work[target + 3]
     for _ in range(count):
         t0 -= work[x] * work[y]
@@ -44,9 +44,9 @@ def _subtract_in_four_lanes(work, target, x, x_stride, y, y_stride, count):
 
 @compiled
 def subtract_products(work, target, x, x_stride, y, y_stride, count):
-    """Subtract the products of the vectors x + i * x_stride and y + i * y_stride, i < `count`, from vector `target`.
+    """In each lane, subtract `count` products from the vector `target`.
 
-    A vector has one number for each lane; `target`, x and y are offsets in `work`.
+    Product i is that of the vectors with the offsets x + i * x_stride and y + i * y_stride in `work`.
     """
     for k in range(0, LANES, 4):
         x_0, y_0 = x * LANES + k, y * LANES + k
@@ -55,9 +55,9 @@ def subtract_products(work, target, x, x_stride, y, y_stride, count):
 
 @merged
 def subtract_row_product(work, target, entries, pattern, i, y):
-    """Subtract from `target` the dot product of row i of a sparse matrix and the vector y.
+    """Subtract from `target` the dot product of row i of a sparse matrix and the vector y, in each lane.
 
-    `entries`: offset of the entries of the matrix, row by row; `pattern`: see module docstring.
+    `entries`: offset of the nonzero entries of the matrix, row by row; `pattern`: their columns, see module docstring.
     """
     for e in range(pattern[i], pattern[i + 1]):
         subtract_products(work, target, entries + e - pattern[0], 1, y + pattern[e], 1, 1)
@@ -72,9 +72,10 @@ def _multiply_vector(work, target, factor):
 
 @compiled
 def _cholesky(work, pattern, n_rows, n_redundant, row, factors, shift):
-    """Store the Cholesky factor of G G^T + shift I + Z^T Z in each lane, with the inverse of its diagonal entries.
+    """Store the Cholesky factor of G G^T + shift I + Z^T Z in each lane, with inverted diagonal entries.
 
-    The factor is stored in `factors`, see `factor_gram`. `row` (n) is scratch, with zeros on entry and on return.
+    G and Z are parts of `factors`, where the Cholesky factor is stored, too; see `factor_gram`. Z has n_redundant rows.
+    `row` (n) is scratch, with zeros on entry and on return.
     """
     n_entries = pattern[n_rows] - pattern[0]
     gram = factors + n_entries + n_rows
@@ -101,10 +102,11 @@ def _cholesky(work, pattern, n_rows, n_redundant, row, factors, shift):
 
 @compiled
 def factor_gram(work, pattern, moves, n_rows, n_redundant, G, row, factors):
-    """Store in `factors` G (scaled), 1 / norms of its rows, the Cholesky factor of G G^T + Z^T Z (shifted), and Z.
+    """Prepare the least changes that satisfy linear equations with the constraint Jacobian G, in each lane.
 
-    Z contains the combinations of redundant rows, see module docstring. Columns of fixed coordinates (`moves` = 0)
-    are set to zero; then the rows of G are scaled to norm 1. DIAGONAL_SHIFT shifts the factored matrix.
+    Store in `factors`: G with columns of fixed coordinates (`moves` = 0) set to zero and rows scaled to norm 1; the
+    reciprocals of the norms; the Cholesky factor of G G^T + DIAGONAL_SHIFT I + Z^T Z; and Z, the combinations of rows
+    of G that vanish, see module docstring. `row` (n): scratch, zero on entry.
     """
     n_entries = pattern[n_rows] - pattern[0]
     for i in range(n_rows):
@@ -129,7 +131,7 @@ def factor_gram(work, pattern, moves, n_rows, n_redundant, G, row, factors):
 
 @compiled
 def _find_redundant_combinations(work, pattern, n_rows, n_redundant, row, factors):
-    """Store Z, eigenvectors of the n_redundant smallest eigenvalues of G G^T; NaN if an eigenvalue is too large."""
+    """Store in `factors` Z, eigenvectors of G G^T for the n_redundant smallest eigenvalues; NaN if one is large."""
     gram = factors + pattern[n_rows] - pattern[0] + n_rows
     Z = gram + n_rows * n_rows
     scratch = Z + n_redundant * n_rows
@@ -151,7 +153,7 @@ def _find_redundant_combinations(work, pattern, n_rows, n_redundant, row, factor
 
 @compiled
 def normalise_vector(work, x, n_rows, scratch):
-    """Scale x (n_rows) to norm 1; store the reciprocal of the norm of x on entry in the vector `scratch`."""
+    """Scale x (n_rows) to norm 1; store 1 / (norm before scaling) in the vector `scratch`."""
     fill_field(work, scratch, 0.0)
     subtract_products(work, scratch, x, 1, x, 1, n_rows)
     for k in range(LANES):
@@ -162,7 +164,7 @@ def normalise_vector(work, x, n_rows, scratch):
 
 @compiled
 def _remove_redundant_components(work, n_rows, n_redundant, Z, x, scratch):
-    """Subtract from x (n_rows) its components along the rows of Z; overwrite the vector `scratch`."""
+    """Subtract from x (n_rows) its components along the n_redundant rows of Z, which have norm 1."""
     for w in range(n_redundant):
         z = Z + w * n_rows
         fill_field(work, scratch, 0.0)
@@ -175,7 +177,7 @@ def _remove_redundant_components(work, n_rows, n_redundant, Z, x, scratch):
 
 @compiled
 def _solve_with_gram(work, n_rows, factor, x):
-    """Replace x (n_rows) by the solution y of G G^T y = x; `factor`: offset of the Cholesky factor of G G^T."""
+    """Replace x (n_rows) by y, the solution of G G^T y = x; `factor`: offset of the Cholesky factor of G G^T."""
     for i in range(n_rows):
         subtract_products(work, x + i, factor + i * n_rows, 1, x, 1, i)
         _multiply_vector(work, x + i, factor + i * n_rows + i)
@@ -186,9 +188,9 @@ def _solve_with_gram(work, n_rows, factor, x):
 
 @compiled
 def solve_along_rows(work, pattern, n, n_rows, n_redundant, factors, x, out):
-    """Replace x (n_rows) by the solution y of G G^T y = x, and store -G^T y in `out` (n).
+    """Solve G G^T y = x; replace x (n_rows) by y, and store -G^T y, the least d with G d = -x, in `out` (n).
 
-    The rows of G are scaled to norm 1. First, the components of x along the rows of Z are removed.
+    G: Jacobian with rows scaled to norm 1. First, components of x along vanishing combinations of rows are removed.
     """
     gram = factors + pattern[n_rows] - pattern[0] + n_rows
     Z = gram + n_rows * n_rows
@@ -203,7 +205,7 @@ def solve_along_rows(work, pattern, n, n_rows, n_redundant, factors, x, out):
 
 @compiled
 def solve_least_change(work, pattern, n, n_rows, n_redundant, factors, x, change):
-    """Store in `change` (n) the d of smallest norm with G d = -x (NaN in lanes with dependent rows); overwrite x."""
+    """Store in `change` (n) the least d with C_q d = -x (NaN in lanes where constraints are dependent); overwrite x."""
     for i in range(n_rows):
         _multiply_vector(work, x + i, factors + pattern[n_rows] - pattern[0] + i)
     solve_along_rows(work, pattern, n, n_rows, n_redundant, factors, x, change)
@@ -211,29 +213,30 @@ def solve_least_change(work, pattern, n, n_rows, n_redundant, factors, x, change
 
 MAX_ITERATIONS = 12  # largest number of steps of the Gauss-Newton iteration
 ROUNDING_FACTOR = 64.0  # a constraint holds if its residual is at most this number of rounding errors of its terms
-# another assembly counts as near if a displaced position is projected farther than this from its linear prediction by
-# C_q, relative to the displacement
+# displaced positions are projected to find other assemblies: one counts as near if a result differs from its linear
+# prediction (the displacement without its part normal to the constraints) by more than this part of the displacement
 MAX_CURVATURE = 0.25
-MIN_EIGENVALUE = 1e-12  # rows of norm 1 count as independent if all eigenvalues of G G^T are at least this
+MIN_EIGENVALUE = 1e-12  # constraints are independent if all eigenvalues of G G^T exceed this (rows of G have norm 1)
 N_WEAKEST_ITERATIONS = 10  # number of inverse iterations for the weakest direction, see `offsets_in_memory`
-N_REDUNDANT = 5  # index in `settings` of the number of redundant rows; `settings` of runs has N_EVALUATIONS there
-# three other guesses. A guess is displaced from the projected positions by its first factor times the change from the
-# first guess to the projected positions, plus its second factor times the weakest direction
+N_REDUNDANT = 5  # index in `settings` of the number of redundant rows, in place of N_EVALUATIONS
+# factors (a, b) of three other guesses, p + a (p - p_0) + b d, where p_0 is the first guess, p its projection onto the
+# constraints, and d the direction that the constraints determine least
 OTHER_GUESSES = ((-2.0, 0.0), (0.0, 1.0), (0.0, -1.0))
 
 
 def offsets_in_memory(memory, n, n_rows, n_entries, n_redundant):
-    """Return the offsets (in vectors) of the parts of the method's memory, which begins at `memory`, and of its end.
+    """Return the offsets (in vectors) of the arrays in the method's memory, which begins at `memory`, and of its end.
 
-    The memory begins with C and C_t (n_rows each) and the entries of G, which the generated code writes. Then follow
+    The memory begins with C and C_t (n_rows each) and the entries of G = C_q, which the generated code writes. Then
+    follow
 
     - x (n_rows), a right-hand side
     - change (n), of positions or velocities
-    - nearest_positions (n), the projected positions; change_from_guess (n), from the guess to these positions
+    - nearest_positions (n), the guess projected onto the constraints; change_from_guess (n), from the guess to these
     - weakest_direction (n), the direction that the rows of G determine least
-    - displacement (n), of another guess from the projected positions
+    - displacement (n), of another guess from `nearest_positions`
     - row (n), a row of G
-    - results of `factor_gram` at the projected positions, and at NEW, the current iterate (q, v), see layout.py
+    - results of `factor_gram` at `nearest_positions`, and at NEW, the state after the last iteration
     """
     G = memory + 2 * n_rows
     x = G + n_entries
@@ -276,7 +279,7 @@ def _largest_value(work, offset, count, k):
 
 @merged
 def _constraints_hold(work, pattern, n, n_rows, C, G, new, k):
-    """Return whether every constraint holds in lane k, up to rounding errors of its terms."""
+    """Return True if every constraint holds in lane k, up to the rounding errors of its terms."""
     tolerance = ROUNDING_FACTOR * np.finfo(np.float64).eps * _largest_value(work, new, n, k)
     for i in range(n_rows):
         off, terms = abs(work[(C + i) * LANES + k]), 0.0
@@ -289,7 +292,7 @@ def _constraints_hold(work, pattern, n, n_rows, C, G, new, k):
 
 @compiled
 def _gauss_newton(code, settings, control, pattern, moves, work):
-    """Project the positions of NEW onto the constraints by Gauss-Newton steps; clear RUNNING where this fails."""
+    """Project the positions NEW onto the constraints by Gauss-Newton steps; set RUNNING to 0 where this fails."""
     n, n_rows, n_redundant = settings[at.N], settings[at.N_ROWS], settings[N_REDUNDANT]
     _, new, _, _, _, _, _, memory = offsets_in_work(n, n_rows, settings[at.N_NUMBERS])
     n_entries = pattern[n_rows] - pattern[0]
@@ -311,7 +314,7 @@ def _gauss_newton(code, settings, control, pattern, moves, work):
                 continue
             for j in range(n):
                 work[(new + j) * LANES + k] += work[(change + j) * LANES + k]
-            # even if the constraints already hold, the last change is applied, for the best accuracy
+            # if the constraints already held before the last change, applying it still improves the accuracy
             if _constraints_hold(work, pattern, n, n_rows, memory, G, new, k):
                 work[at.UNCONVERGED * LANES + k] = 0.0
             else:
@@ -325,7 +328,7 @@ def _gauss_newton(code, settings, control, pattern, moves, work):
 
 @compiled
 def _project_velocities(code, settings, control, pattern, moves, work):
-    """Project the velocities of NEW so that C_q v + C_t = 0; store the results of `factor_gram` at NEW."""
+    """Project the velocities v of the state NEW so that C_q v + C_t = 0; set RUNNING to 0 in lanes where this fails."""
     n, n_rows, n_redundant = settings[at.N], settings[at.N_ROWS], settings[N_REDUNDANT]
     _, new, _, _, _, _, _, memory = offsets_in_work(n, n_rows, settings[at.N_NUMBERS])
     n_entries = pattern[n_rows] - pattern[0]
@@ -349,7 +352,7 @@ def _project_velocities(code, settings, control, pattern, moves, work):
 
 @compiled
 def _find_weakest_direction(work, pattern, n, n_rows, n_redundant, factors, x, correction, weakest):
-    """Store the weakest direction in `weakest`, scaled to max|correction|; clear RUNNING where rows are dependent."""
+    """Store the direction that constraints determine least in `weakest`; set RUNNING to 0 if they are dependent."""
     scratch = factors + pattern[n_rows] - pattern[0] + n_rows * (1 + n_rows + n_redundant)
     for i in range(n_rows):
         fill_field(work, x + i, 0.5 + (GOLDEN_SECTION * (i + 1)) % 1.0)
@@ -368,7 +371,10 @@ def _find_weakest_direction(work, pattern, n, n_rows, n_redundant, factors, x, c
 
 @compiled
 def _check_nearby_guesses(code, settings, control, pattern, moves, work):
-    """Clear RUNNING in lanes where the projection of another guess is far from its linear prediction by C_q."""
+    """Set RUNNING to 0 in lanes where another assembly may be as near to the guess.
+
+    This is so if the projection of one of OTHER_GUESSES fails, or differs much from its linear prediction.
+    """
     n, n_rows, n_redundant = settings[at.N], settings[at.N_ROWS], settings[N_REDUNDANT]
     _, new, _, _, _, _, _, memory = offsets_in_work(n, n_rows, settings[at.N_NUMBERS])
     _, x, change, nearest, correction, weakest, displacement, _, factors, _, _ = _memory_offsets(
@@ -402,8 +408,9 @@ _START_SIGNATURE = types.void(CODE, INTEGERS, VECTOR, *[INTEGERS] * 2, *[types.f
 def start_lanes(code, settings, control, pattern, moves, numbers, q, v, valid, work):
     """Replace the states q and v (n_runs, n) by their projections onto the constraints at t0.
 
-    `valid` (n_runs,) becomes 1 for runs whose projection succeeds, otherwise 0. pattern : sparsity pattern of G, see
-    module docstring; moves : (n,) 1 for coordinates that may change; numbers : (n_runs, n_numbers) data of the code.
+    `valid` (n_runs,) becomes 1 for runs whose projection succeeds without another assembly nearby, otherwise 0.
+    pattern : sparsity pattern of C_q, see module docstring; moves : (n,) 1 for coordinates that may change, else 0;
+    numbers : (n_runs, n_numbers) data of the generated code.
     """
     n, n_rows, n_redundant, n_runs = settings[at.N], settings[at.N_ROWS], settings[N_REDUNDANT], numbers.shape[0]
     _, new, _, _, _, _, own, memory = offsets_in_work(n, n_rows, numbers.shape[1])
@@ -441,7 +448,7 @@ TABLE, STATES = types.float64[:, ::1], types.float64[:, :, ::1]
 
 @compiled
 def _relative_residual(value, allowed):
-    """Return |value| / allowed; 0 if `value` is zero, otherwise infinity if it is not finite or `allowed` is zero."""
+    """Return |value| / allowed: 0 if `value` is zero; infinity if `value` is not finite, or only `allowed` is zero."""
     if not np.isfinite(value):
         return np.inf
     if value == 0.0:
@@ -451,13 +458,13 @@ def _relative_residual(value, allowed):
 
 @kernel(types.void(KIT, INTEGERS, f8, f8, f8, INTEGERS, TABLE, STATES, STATES, TABLE, VECTOR, VECTOR))
 def motion_residuals(f, sizes, t, rtol, atol, runs, parameters, states_q, states_v, ends, scratch, worst):
-    """Store in `worst` (n_rows,) the largest residual of the equations at the end of each run, relative to its limit.
+    """Store in worst[k] the largest residual of the equations, relative to its limit, at the end of run runs[k].
 
     The equations are C = 0, C_q v + C_t = 0, C_q a = gamma and M a + C_q^T lam = Q. The limit is `rtol` times the
     terms of the equation, and for constraints also the effect of errors `atol` of coordinates and velocities.
-    sizes : n, n_c and the index in p of the first parameter; runs : (n_rows,) index of the run of each row, or -1 to
-    omit the row; parameters : (n_runs, n_p); states_q, states_v : (n_rows, n, n_t), with the end as the last time;
-    ends : (n_rows, n + n_c) a and lam at the end; scratch : (n (n + 3) + n_c (n + 3),) overwritten.
+    sizes : n, n_c and the index in f.p of the first parameter; runs : (m,) indices of runs, or -1 to skip an entry;
+    parameters : (n_runs, n_p); states_q, states_v : (m, n, n_t), with the end as the last time; ends : (m, n + n_c)
+    a and lam at the end; scratch : (n (n + 3) + n_c (n + 3),) overwritten; worst : (m,).
     """
     n, n_c, first = sizes[0], sizes[1], sizes[2]
     M, Q = scratch[: n * n].reshape((n, n)), scratch[n * n : n * n + n]
@@ -515,10 +522,11 @@ def motion_residuals(f, sizes, t, rtol, atol, runs, parameters, states_q, states
 
 @kernel(types.void(KIT, INTEGERS, f8, f8, TABLE, TABLE, TABLE, VECTOR, VECTOR))
 def constraint_residuals(f, sizes, t, min_speed, parameters, q, v, scratch, worst):
-    """Store in `worst` the largest relative residual of C = 0 and C_q v + C_t = 0 for each state, a row of q and v.
+    """Store in worst[k] the largest relative residual of C = 0 and C_q v + C_t = 0 at the state (q[k], v[k]).
 
-    Residuals are relative to the sum of a row of |C_q| times the largest entry of q or v. min_speed : lower bound of
-    the largest velocity in this product, for states at rest; scratch : (n_c (n + 2),) overwritten.
+    Residual i is divided by (sum of |entries| in row i of C_q) * max|q_j|; for velocities, by the same with max|v_j|,
+    but at least min_speed (for states at rest), plus |C_t|. parameters : (n_states, n_p); sizes : n, n_c and the index
+    in f.p of the first parameter; scratch : (n_c (n + 2),) overwritten.
     """
     n, n_c, first = sizes[0], sizes[1], sizes[2]
     C, rate, G = scratch[:n_c], scratch[n_c : 2 * n_c], scratch[2 * n_c :].reshape((n_c, n))

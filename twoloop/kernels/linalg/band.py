@@ -1,7 +1,7 @@
 """Factor and solve banded matrices by LAPACK: the mass matrix, and Newton matrices with a border of constraints.
 
-In LAPACK's band storage, entry (i, j) of a matrix is entry [j, top + i - j] of a C-ordered array (b: bandwidth). For
-the upper triangle of M, top is b. For an LU, top is 2 b, because row exchanges fill another b diagonals.
+In LAPACK's band storage, entry (i, j) of a matrix is entry [j, top + i - j] of a C-ordered array. For the upper
+triangle of the mass matrix M, top is the bandwidth b. For an LU, top is 2 b, because row exchanges fill b diagonals.
 
 The LAPACK library comes with SciPy. Kernels are stored on disk, but addresses of LAPACK routines differ from process to
 process, and must not be part of compiled code. So a run stores `lapack_addresses` in its workspace `w`, and passes one
@@ -19,8 +19,8 @@ from twoloop.kernels.data.common import compiled, inlined, merged
 from twoloop.kernels.data.indices import DONE, MASS_NOT_DEFINITE, SINGULAR
 from twoloop.kernels.linalg.dense import lu_factor, lu_solve
 
-# names of LAPACK routines, and their indices in `lapack_addresses`: Cholesky factorization of a banded matrix (dpbtrf),
-# solution with this factor (dpbtrs); LU factorization and solution of real (dgb) and of complex (zgb) banded matrices
+# names of LAPACK routines for banded matrices, and their indices in `lapack_addresses`: Cholesky factorization (dpbtrf)
+# and solution with its factor (dpbtrs); LU factorization (..trf) and solution (..trs), real (dgb) and complex (zgb)
 ROUTINES = ("dpbtrf", "dpbtrs", "dgbtrf", "dgbtrs", "zgbtrf", "zgbtrs")
 DPBTRF, DPBTRS, DGBTRF, DGBTRS, ZGBTRF, ZGBTRS, N_ROUTINES = range(7)
 
@@ -73,33 +73,33 @@ MIN_BANDED_SIZE = 56
 
 
 def banded_pays(n_q: int, n_c: int, bandwidth: int) -> bool:
-    """Return whether banded algebra is faster than dense algebra, and fits in the arrays for dense algebra."""
+    """Return True if banded algebra is faster than dense algebra, and fits in the arrays for dense algebra."""
     return n_q >= max(MIN_BANDED_SIZE, 3 * bandwidth + 2 + 2 * n_c)
 
 
 @merged
 def has_banded_mass(f):
-    """Return whether M is factored as a banded matrix; False if M is diagonal, because divisions are faster."""
+    """Return True if the mass matrix is factored as a banded matrix; if it is diagonal, divisions are faster."""
     return f.bandwidth >= 0 and f.diagonal_mass == 0
 
 
 @inlined
 def _mass_band(w, b):
-    """Return a view of w.L for the upper triangle of M and, after a factorization, its Cholesky factor."""
+    """Return a view of w.L in band storage: the upper triangle of M, and after a factorization its Cholesky factor."""
     n = w.Q.size
     return w.L.reshape(n * n)[: n * (b + 1)].reshape((n, b + 1))
 
 
 @inlined
 def _mass_diagonals(w, b):
-    """Return a view of the diagonals of M, stored in w.L after the Cholesky factor: M[i, i + k] is at [k, i]."""
+    """Return the part of w.L with the diagonals of M: M[i, i + k] is at [k, i], for k up to the bandwidth b."""
     n = w.Q.size
     return w.L.reshape(n * n)[n * (b + 1) : 2 * n * (b + 1)].reshape((b + 1, n))
 
 
 @compiled
 def factor_banded_mass(f, w):
-    """Store the Cholesky factor and the diagonals of w.M in w.L; return DONE or MASS_NOT_DEFINITE."""
+    """Store the Cholesky factor and the diagonals of the mass matrix w.M in w.L; return DONE or MASS_NOT_DEFINITE."""
     n = w.Q.size
     b = f.bandwidth
     band = _mass_band(w, b)
@@ -123,7 +123,7 @@ def solve_banded_mass(f, w, x):
 
 @compiled
 def add_banded_mass_times(f, w, x, y):
-    """Add M x to y in place, diagonal by diagonal, because loops over the short rows of the band would be slow."""
+    """Add M x to y in place, diagonal by diagonal, because loops over the short rows of the band of M would be slow."""
     n = w.Q.size
     for i in range(n):
         y[i] += w.M[i, i] * x[i]
@@ -138,14 +138,14 @@ def add_banded_mass_times(f, w, x, y):
             y[i + k] += diagonals[k, i] * x[i]
 
 
-# The bordered system [[B, Cq^T], [Cq, 0]] [x; mu] = [r; 0], with a matrix B of bandwidth b, has the solution
-# mu = (Cq B^-1 Cq^T)^-1 Cq B^-1 r, x = B^-1 (r - Cq^T mu). The array `numbers`, real or complex, contains the LU of B,
-# the transpose of B^-1 Cq^T, the LU of Cq B^-1 Cq^T, and scratch (n_c).
+# The bordered system [[B, Cq^T], [Cq, 0]] [x; mu] = [r; 0] occurs in Newton's method: B is a matrix of bandwidth b, and
+# Cq the constraint Jacobian. Its solution is mu = (Cq B^-1 Cq^T)^-1 Cq B^-1 r, x = B^-1 (r - Cq^T mu). The array
+# `numbers`, real or complex, contains the LU of B; the transpose of B^-1 Cq^T; the LU of Cq B^-1 Cq^T; scratch (n_c).
 
 
 @inlined
 def lu_band(numbers, n, b):
-    """Return the view of `numbers` for B and, after a factorization, for its LU; entry (i, j) is [j, 2 b + i - j]."""
+    """Return the part of `numbers` for a matrix B of bandwidth b, then for its LU; entry (i, j) is [j, 2 b + i - j]."""
     return numbers[: n * (3 * b + 1)].reshape((n, 3 * b + 1))
 
 
@@ -169,7 +169,10 @@ def _scratch_view(numbers, n, n_c, b):
 
 @compiled
 def factor_bordered(w, b, Cq, numbers, pivots, factorize, substitute):
-    """Factor the bordered system in `numbers` by LAPACK routines, such as DGBTRF and DGBTRS; return a code."""
+    """Factor the system [[B, Cq^T], [Cq, 0]], with the banded matrix B in `numbers`, in place; return DONE or SINGULAR.
+
+    `factorize`, `substitute`: indices of LAPACK routines, such as DGBTRF and DGBTRS.
+    """
     n_c, n = Cq.shape
     band = lu_band(numbers, n, b)
     exchanges = pivots[: n - n_c].view(np.int32)
@@ -191,7 +194,7 @@ def factor_bordered(w, b, Cq, numbers, pivots, factorize, substitute):
 
 @compiled
 def solve_bordered(w, b, Cq, numbers, pivots, substitute, x):
-    """Replace x (n_q), the right-hand side r, by the solution of the bordered system factored by `factor_bordered`."""
+    """Replace x (n_q) by the x of [[B, Cq^T], [Cq, 0]] [x; mu] = [x; 0], using the factors from `factor_bordered`."""
     n_c, n = Cq.shape
     band, exchanges = lu_band(numbers, n, b), pivots[: n - n_c].view(np.int32)
     call_lapack(w.lapack[substitute], (NO_TRANSPOSE, n, b, b, 1, band, 3 * b + 1, exchanges, x, n))

@@ -32,7 +32,7 @@ def largest_of(x):
 
 @compiled
 def sum_rows(weights, rows, total):
-    """Store in `total` the sum over k of weights[k] rows[k]; four rows are added at once, so that LLVM vectorises."""
+    """Store in `total` the sum over k of weights[k] * rows[k]; four rows are added at once, so that LLVM vectorises."""
     remainder = weights.size % 4
     for m in range(total.size):
         total[m] = 0.0
@@ -48,7 +48,7 @@ def sum_rows(weights, rows, total):
 
 @merged
 def contains(numbers, number):
-    """Return whether `number` is one of `numbers`."""
+    """Return True if `number` is one of `numbers`."""
     is_contained = False
     for element in numbers:
         is_contained = is_contained or element == number
@@ -65,7 +65,7 @@ def _magnitude(x):
 def lu_factor(A, pivots):
     """Replace A, real or complex, by its factors L and U, with 1/u_kk on the diagonal; store row exchanges in `pivots`.
 
-    Returns min|u_kk| / max|u_kk|, or 0 if A is singular or a pivot is not finite.
+    Return min|u_kk| / max|u_kk| of the pivots u_kk, or 0 if A is singular or a pivot is not finite.
     """
     n = A.shape[0]
     smallest = 1e300
@@ -204,9 +204,9 @@ def ldl_solve_rows(A, B):
 
 @merged
 def has_new_entries(G, pattern):
-    """Return whether G has a nonzero entry where `pattern` is 0."""
+    """Return True if G has a nonzero entry where `pattern` is 0."""
     entries, recorded = G.reshape(G.size), pattern.reshape(pattern.size)
-    sum_of_new_entries = 0.0  # sum of the new |entries|: summing needs no branch, and new entries are rare
+    sum_of_new_entries = 0.0  # add up |entries| where `pattern` is 0: this is faster than to test each entry
     for i in range(recorded.size):
         sum_of_new_entries += abs(entries[i]) * (1.0 - recorded[i])
     return sum_of_new_entries != 0.0  # also true for NaN
@@ -214,7 +214,7 @@ def has_new_entries(G, pattern):
 
 @compiled
 def update_pattern(G, pattern):
-    """Set `pattern` to 1 where G is not zero; return whether an entry of `pattern` changes."""
+    """Set `pattern` to 1 where G is not zero; return True if an entry of `pattern` changes."""
     if not has_new_entries(G, pattern):
         return False
     has_new = False

@@ -1,14 +1,16 @@
-"""Choose dependent coordinates for generated code, as pivots in rows of G, in blocks of one or two rows.
+"""Choose dependent coordinates for generated code: pivots in the constraint Jacobian G, in blocks of one or two rows.
 
 Constant pivots are chosen first: they need no division and do not change. Among varying entries that are large enough,
-not the largest is chosen but the one that causes the least fill-in: so nearby positions mostly have the same pivots.
+the pivot is not the largest but the one that causes the least fill-in: so nearby positions mostly have the same pivots.
 """
 
 from twoloop.kernels.data.common import INTEGERS, MATRIX, VECTOR, compiled, i8, kernel, merged
 
-NONE, NUMBER, VARIES = 0, 1, 2  # kinds of entries of G: always zero, constant, varying
+# In this module, R contains the rows of G during the elimination; K (same shape) the kinds of their entries: always
+# zero, constant, varying. `columns[i]` lists the columns of entries of row i, and row_sizes[i] is their number
+NONE, NUMBER, VARIES = 0, 1, 2
 ROWS_SEARCHED = 4  # to save time, pivot blocks are sought only in this number of rows, which have the fewest entries
-# limits that entries must meet to be a pivot block: three pairs of limits, tried in this order, each looser
+# limits for a pivot block: three pairs, tried in this order until a block meets one; each pair is looser
 # - MAX_SQUARES: largest sum of squares of the changes of the block's coordinates if each other coordinate moves by 1
 # - MIN_SINE_SQUARES: smallest squared sine of the angle between the columns of two pivots; for a single pivot, smallest
 #   squared ratio of the pivot to the norm of its column of G
@@ -16,7 +18,7 @@ ROWS_SEARCHED = 4  # to save time, pivot blocks are sought only in this number o
 # limits are well above MIN_PIVOT_SQUARE of generate/null_space.py, so that a choice stays valid for some motion
 MAX_SQUARES, MIN_SINE_SQUARES = (4.0, 20.0, 200.0), (0.2**2, 0.1**2, 0.04**2)
 MIN_CONSTANT_PIVOT = 1e-3  # smallest constant that may be a pivot, relative to the largest entry of its row
-CANCELLATION = 1e-12  # the difference a - b of two constants counts as zero up to this fraction of |b|
+CANCELLATION = 1e-12  # in an elimination, the difference a - b of constants counts as zero up to this fraction of |b|
 
 
 def scratch_sizes(n_rows: int, n: int) -> tuple[int, int]:
@@ -26,7 +28,7 @@ def scratch_sizes(n_rows: int, n: int) -> tuple[int, int]:
 
 @compiled
 def _find_constant_pivot(R, K, columns, row_active, row_sizes, column_sizes):
-    """Return n * row + column of the constant entry that, as a pivot, causes the least fill-in; -1: no such entry."""
+    """Return n * row + column of the constant entry of R that causes the least fill-in as a pivot; -1: none exists."""
     best, best_fill, best_size, (m, n) = -1, 0, 0, R.shape
     for i in range(m):
         if not row_active[i]:
@@ -47,9 +49,9 @@ def _find_constant_pivot(R, K, columns, row_active, row_sizes, column_sizes):
 
 @compiled
 def _is_pivot_block(R, block_columns, squared_norms, i, k, j, l, max_squares, min_sine_square):
-    """Return whether rows i, k and columns j, l may be a pivot block; a single pivot has i == k and j == l.
+    """Return True if rows i, k and columns j, l of R meet the limits of a pivot block; single pivot: i == k, j == l.
 
-    `block_columns`: columns of the entries of rows i and k.
+    `block_columns`: columns of the entries of rows i and k. `squared_norms`: of the columns of G.
     """
     total = 0.0
     if i == k:
@@ -72,7 +74,7 @@ def _is_pivot_block(R, block_columns, squared_norms, i, k, j, l, max_squares, mi
 
 @compiled
 def _merge_columns(columns, row_sizes, i, k, union):
-    """Store the columns of the entries of rows i and k in `union`, in ascending order; return their number."""
+    """Store in `union` the columns in which row i or row k has an entry, in ascending order; return their number."""
     n, x, y = 0, 0, 0
     while x < row_sizes[i] or y < row_sizes[k]:
         j = columns[i, x] if x < row_sizes[i] else union.size
@@ -86,10 +88,10 @@ def _merge_columns(columns, row_sizes, i, k, union):
 def _find_varying_pivots(R, K, columns, row_active, row_sizes, column_sizes, squared_norms, rows, union, block):
     """Store in `block` the two rows and two columns of a pivot block of varying entries; return False if none is found.
 
-    A single pivot has its row and its column twice. `rows` and `union` are scratch.
+    For a single pivot, its row and its column are stored twice. `rows` and `union` are scratch.
     """
     n_rows = 0
-    for i in range(len(R)):  # sort the rows by their numbers of entries
+    for i in range(len(R)):  # sort the rows that have no pivot yet by their numbers of entries
         if row_active[i]:
             position = n_rows
             while position > 0 and row_sizes[rows[position - 1]] > row_sizes[i]:
@@ -124,7 +126,7 @@ def _find_varying_pivots(R, K, columns, row_active, row_sizes, column_sizes, squ
 
 @merged
 def _append_entry(K, columns, row_sizes, i, j):
-    """Append column j to the list of the columns of row i, unless entry (i, j) is always zero."""
+    """Append column j to columns[i], the list for row i, unless entry (i, j) is always zero."""
     if K[i, j] != NONE:
         columns[i, row_sizes[i]] = j
         row_sizes[i] += 1
@@ -132,7 +134,7 @@ def _append_entry(K, columns, row_sizes, i, j):
 
 @compiled
 def _subtract_multiple(R, K, columns, row_sizes, column_sizes, union, r, j, i):
-    """Subtract from row r the multiple of row i that makes entry (r, j) zero; entry (i, j) is 1."""
+    """Subtract from row r of R the multiple of row i that makes entry (r, j) zero; entry (i, j) must be 1."""
     factor, kind = R[r, j], K[r, j]
     R[r, j], K[r, j] = 0.0, NONE
     n = _merge_columns(columns, row_sizes, r, i, union)
@@ -151,7 +153,7 @@ def _subtract_multiple(R, K, columns, row_sizes, column_sizes, union, r, j, i):
 
 @compiled
 def _eliminate(R, K, columns, row_active, row_sizes, column_sizes, union, i, k, j, l):
-    """Solve row i for column j (if i == k) or rows i and k for columns j and l; then eliminate these columns."""
+    """Eliminate a pivot block (rows i, k, columns j, l): solve its rows for its columns, and clear these elsewhere."""
     row_active[i] = row_active[k] = 0
     n, is_single = _merge_columns(columns, row_sizes, i, k, union), i == k
     a, b, c, d = R[i, j], R[i, l], R[k, j], R[k, l]
@@ -183,8 +185,8 @@ def _eliminate(R, K, columns, row_active, row_sizes, column_sizes, union, i, k, 
 def choose_dependent_columns(G, kinds, rows, n_kept, numbers, integers, out):
     """Choose dependent columns of G for the rows rows[:n_kept]; return the number of pivot blocks, or 0 on failure.
 
-    `kinds` has the kind of each entry of G, row by row. `out` receives two rows (as indices in `rows`) and two columns
-    of each block; a single pivot has its row and its column twice. `numbers`, `integers`: scratch (`scratch_sizes`).
+    `kinds`: kind of each entry of G, row by row: NONE, NUMBER or VARIES. `out` receives two rows (as indices in `rows`)
+    and two columns of each block; for a single pivot, both twice. `numbers`, `integers`: scratch (`scratch_sizes`).
     """
     n = G.shape[1]
     if n_kept > n:

@@ -20,106 +20,108 @@ from twoloop.kernels.linalg.dense import copy, lu_factor, lu_sign, lu_solve
 MIN_PIVOT_RATIO = 0.1  # smallest pivot, relative to the largest entry in its column
 MAX_SPARSE_RATIO = 0.5  # sparse factors are used if they need at most this share of the subtractions of dense factors
 MAX_SPARSE_ROWS = 3  # up to this number of rows, factors are sparse whatever the number of subtractions
-ZERO_PIVOT = 1e-11  # pivots count as zero up to this fraction of the largest pivot so far
-# most subtractions in a program of r rows: MIN_SUBTRACTIONS + SUBTRACTIONS_PER_ROW * r; with more, factors are dense
+ZERO_PIVOT = 1e-11  # if a pivot is at most this fraction of the largest pivot before it, the matrix is singular
+# if a program for r rows needs more than MIN_SUBTRACTIONS + SUBTRACTIONS_PER_ROW * r subtractions, factors are dense
 MIN_SUBTRACTIONS, SUBTRACTIONS_PER_ROW = 2000, 100
 MAX_ENTRIES_PER_LINE = 64  # largest number of entries in a row or column of sparse factors; with more, they are dense
 
 ORDER_CHOSEN, SINGULAR_MATRIX, TOO_MANY_ENTRIES = range(3)  # codes of `choose_order`; the last means: use dense factors
 
-# indices of the numbers at the beginning of `index`
+# indices of the numbers at the beginning of `index`, the program of a factorization
 (
     SIZE,  # number of rows r
-    DENSE,  # 1: the factors are dense
+    DENSE,  # 1: the factors are dense; 0: they are sparse
     SIGN,  # sign (1 or -1) of the permutation of rows times the sign of the permutation of columns
-    N_SLOTS,  # number of entries of the factors
-    FIRST_LOWER,  # index of the first entry of L
+    N_SLOTS,  # number of entries of the sparse factors
+    FIRST_LOWER,  # index in `values` of the first entry of L
     WIDTH,  # number of columns of the Jacobian
     N_HEAD,
 ) = range(7)
-# After these numbers, `index` contains the following arrays; entries are sorted: diagonal, U from its last row up, L
+# After these numbers, `index` contains the arrays below (r: number of rows). The entries of the factors are numbered in
+# this order: diagonal; U without diagonal, from its last row up; L row by row
 # - rows (r) and columns (r) of the matrix in the order of elimination; row exchanges of dense factors (r)
-# - for each row of U, the index of its first entry (r), then the index after its last entry (r)
-# - for each row of L, the index of its first entry, followed by the end of L (r + 1)
-# - for each entry its row, column and source: index in `entries` (see `factor`) of its initial value; fill-in: of a 0
-# - for each subtraction, the index of the entry that it changes; then the lists of `views_of_lists`
+# - for each row of U, the number of its first entry (r); for each row of U, 1 + the number of its last entry (r)
+# - for each row of L, the number of its first entry (r); 1 + the number of the last entry of L
+# - the row of each entry; the column of each entry; the source of each entry: the index of its initial value in
+#   `entries`, an argument of `factor`, or of a zero for fill-in
+# - for each subtraction, the number of the entry that it changes; then the lists of `views_of_lists`
 
-# indices of arrays that have one number for each row or column, while an order of elimination is chosen
+# indices in `counts` of arrays with one number for each row or column, used while an order of elimination is chosen
 (
     ROW_SIZE,  # number of entries in the list of a row
     COLUMN_SIZE,  # number of entries in the list of a column, without eliminated rows
-    ACTIVE_ROW_SIZE,  # number of entries of a row in columns that are not eliminated
+    ACTIVE_ROW_SIZE,  # number of entries of a row in columns that are not eliminated yet
     ROW_POSITION,  # position of a row in the order so far
     COLUMN_POSITION,  # position of a column in the order so far
     LOOKUP,  # scratch
     N_COUNTS,
 ) = range(7)
-# indices of lists: columns and sources of the entries of a row, and rows of the entries of a column
+# indices in `lists`: for each row, the columns and the sources of its entries; for each column, the rows of its entries
 COLUMNS, SOURCES, ROWS, N_LISTS = range(4)
 
 
 def index_size(r: int) -> int:
-    """Return the length of `index`, the program, for r rows."""
+    """Return the length of `index`, the program that factors a matrix of r rows."""
     return N_HEAD + 6 * r + 1 + (3 + N_LISTS) * r * min(r, MAX_ENTRIES_PER_LINE) + max_subtractions(r) + N_COUNTS * r
 
 
 def values_size(r: int, may_be_dense: bool = True) -> int:
-    """Return the length of `values`, the factors, for r rows."""
+    """Return the length of `values`, the factors of a matrix of r rows."""
     return r * (r if may_be_dense else min(r, MAX_ENTRIES_PER_LINE)) + r
 
 
 def max_subtractions(r: int) -> int:
-    """Return the largest number of subtractions in a program of r rows, for the size of its memory."""
+    """Return the largest number of subtractions in a program for r rows: its memory is allocated for this number."""
     return min(r * r * (r + 1) // 2, MIN_SUBTRACTIONS + SUBTRACTIONS_PER_ROW * r)
 
 
 @inlined
 def rows_of(index):
-    """Return the indices of the rows in the order of elimination."""
+    """Return the indices of the rows of a factored matrix, in the order of elimination."""
     return index[N_HEAD : N_HEAD + index[SIZE]]
 
 
 @inlined
 def columns_of(index):
-    """Return the indices of the columns in the order of elimination."""
+    """Return the indices of the columns of a factored matrix, in the order of elimination."""
     return index[N_HEAD + index[SIZE] : N_HEAD + 2 * index[SIZE]]
 
 
 @inlined
 def row_exchanges_of(index):
-    """Return the row exchanges of dense factors, see `lu_factor`."""
+    """Return the view of `index` for the row exchanges of dense factors, see `lu_factor`."""
     return index[N_HEAD + 2 * index[SIZE] : N_HEAD + 3 * index[SIZE]]
 
 
 @merged
 def index_of_upper_begins(r):
-    """Return where in `index` the list of the first entries of the rows of U begins."""
+    """Return where in `index` the list begins that says at which index in `values` each row of U begins."""
     return N_HEAD + 3 * r
 
 
 @merged
 def index_of_upper_ends(r):
-    """Return where in `index` the list of the ends of the rows of U begins."""
+    """Return where in `index` the list begins that says at which index in `values` each row of U ends."""
     return N_HEAD + 4 * r
 
 
 @merged
 def index_of_lower_begins(r):
-    """Return where in `index` the list of the first entries of the rows of L begins."""
+    """Return where in `index` the list begins that says at which index in `values` each row of L begins."""
     return N_HEAD + 5 * r
 
 
 @merged
 def index_of_entries(r):
-    """Return where in `index` the lists of rows, columns and sources of the entries begin."""
+    """Return where in `index` the row of each entry of the factors is listed; the columns and the sources follow."""
     return N_HEAD + 6 * r + 1
 
 
 @inlined
 def views_of_lists(index, values):
-    """Return views of the arrays for choosing an order: counts (N_COUNTS, r), lists (N_LISTS, r, w), values (r, w).
+    """Return views of the scratch for choosing an order: counts (N_COUNTS, r), lists (N_LISTS, r, w), values (r, w).
 
-    w is the largest number of entries in a row or column.
+    r: number of rows; w: largest number of entries in a row or column. For counts and lists see ROW_SIZE, COLUMNS.
     """
     r = index[SIZE]
     width = min(r, MAX_ENTRIES_PER_LINE)
@@ -139,7 +141,7 @@ def clear_lists(index, r):
 
 @compiled
 def put_entry(matrix, i, j, number, source):
-    """Add entry (i, j), with its value `number` and its `source`, to the lists; return False if a list is full."""
+    """Add entry (i, j) = `number` to the lists, with `source`, the index of its value; return False if one is full."""
     counts, lists, numbers = matrix
     n, m = counts[ROW_SIZE, i], counts[COLUMN_SIZE, j]
     if n == numbers.shape[1] or m == numbers.shape[1]:
@@ -154,10 +156,10 @@ def put_entry(matrix, i, j, number, source):
 
 @compiled
 def _choose_pivot(matrix, rows, columns, k):
-    """Return row and column of pivot k; (-1, -1) if no entry is large enough.
+    """Choose pivot number k; return its row and column, or (-1, -1) if no entry is large enough.
 
-    Among the entries that are large enough (see MIN_PIVOT_RATIO), the pivot causes the least fill-in. If several cause
-    equal fill-in, the largest of them is chosen; among equally large ones, the first in the order so far.
+    Among the entries that are large enough (see MIN_PIVOT_RATIO), choose the one that causes the least fill-in. If
+    several cause equal fill-in, choose the largest of them; among equally large ones, the first in the order so far.
     """
     counts, lists, numbers = matrix
     r = rows.size
@@ -186,7 +188,7 @@ def _choose_pivot(matrix, rows, columns, k):
 
 @merged
 def _exchange(order, position, k, chosen):
-    """Exchange two indices so that `chosen` gets to position k of `order`; return the sign of the permutation."""
+    """Exchange two indices so that `chosen` gets to position k of `order`; return -1, or 1 if it was there already."""
     previous, exchanged = position[chosen], order[k]
     order[k], order[previous] = chosen, exchanged
     position[chosen], position[exchanged] = k, previous
@@ -195,10 +197,10 @@ def _exchange(order, position, k, chosen):
 
 @compiled
 def _eliminate_entry(matrix, row, column, pivot, j, zero_source):
-    """Subtract from column j the multiple of the pivot column that removes entry (row, j).
+    """Subtract from column j the multiple of the pivot column that makes entry (row, j) zero.
 
-    `row` and `column` are the pivot row and the pivot column, `pivot` is the entry in both. Fill-in entries get the
-    source `zero_source`. Return False if there is no space for a fill-in entry.
+    `row` and `column`: indices of the pivot's row and column; `pivot`: its value. Fill-in entries get the source
+    `zero_source`, the index of a zero. Return False if there is no space for a fill-in entry.
     """
     counts, lists, numbers = matrix
     for m in range(counts[COLUMN_SIZE, j]):
@@ -227,8 +229,8 @@ def _eliminate_entry(matrix, row, column, pivot, j, zero_source):
 def choose_order(index, matrix, zero_source, zero_ratio):
     """Choose the pivots by eliminating `matrix` step by step, and store the program in `index`; return a code.
 
-    Fill-in entries get the source `zero_source`, the index of a zero. A pivot counts as zero up to `zero_ratio` times
-    the largest pivot so far. The code is ORDER_CHOSEN (`index` is complete), SINGULAR_MATRIX or TOO_MANY_ENTRIES.
+    Codes: ORDER_CHOSEN (`index` is complete); TOO_MANY_ENTRIES (use dense factors); SINGULAR_MATRIX (a pivot is at most
+    `zero_ratio` times the largest so far). Fill-in entries get the source `zero_source`, the index of a zero.
     """
     counts, lists, numbers = matrix
     r = index[SIZE]
@@ -270,7 +272,7 @@ def _sort_row(columns, sources, size, position):
 
 @compiled
 def _sort_and_count(rows, counts, lists):
-    """Sort the lists of the rows by the order of elimination; return the numbers of entries and of subtractions.
+    """Sort the entries of each row by the order of elimination; return the numbers of all entries and subtractions.
 
     Store in counts[ACTIVE_ROW_SIZE] the number of entries of each row of U, in the order of elimination.
     """
@@ -331,15 +333,14 @@ def _store_program(index, counts, lists):
     return True
 
 
-# largest |multiplier| of an accurate elimination; above this limit, another order of elimination is chosen
-MAX_MULTIPLIER = 1e3
+MAX_MULTIPLIER = 1e3  # largest accepted |multiplier| in an elimination; above, another order of elimination is chosen
 
 
 @compiled
 def make_program(G, pattern, rows, columns, index, values):
     """Store in `index` the program that factors G[rows][:, columns]; return False if this matrix is singular.
 
-    The matrix may have entries only where `pattern` is not zero; `values` is scratch.
+    `rows`, `columns`: indices. G may have entries only where `pattern` is not zero; `values` is scratch.
     """
     r, width = rows.size, G.shape[1]
     clear_lists(index, r)
@@ -370,7 +371,7 @@ def factor(entries, index, values):
     """Store in `values` the factors of G[rows][:, columns], 1/pivot on the diagonal; return min|pivot| / max|pivot|.
 
     `entries` is G, with a last row of zeros, as a vector. If a pivot is zero or not finite, or if a multiplier exceeds
-    MAX_MULTIPLIER, the result is negative (0 for dense factors): then another order of elimination must be chosen.
+    MAX_MULTIPLIER, return -1 (dense factors: 0): another order of elimination must be chosen.
     """
     r = index[SIZE]
     if index[DENSE] == 1:
@@ -388,9 +389,9 @@ def factor(entries, index, values):
 
 @merged
 def run_program(index, values):
-    """Replace the matrix in `values` by its factors, by the program in `index`; return min|pivot| / max|pivot|.
+    """Factor the matrix in `values` in place, by the program in `index`; return min|pivot| / max|pivot|.
 
-    The result is negative in the cases that `factor` describes.
+    Return -1 if a pivot is zero or not finite, or if a multiplier exceeds MAX_MULTIPLIER.
     """
     r, n_slots = index[SIZE], index[N_SLOTS]
     column_list = index_of_entries(r) + n_slots
@@ -435,7 +436,7 @@ def determinant_sign(index, values):
 
 @merged
 def solve(index, values, x):
-    """Replace the right-hand side x, in the order of rows_of, by the solution, in the order of columns_of."""
+    """Replace the right-hand side x, in the order of `rows_of`, by the solution, in the order of `columns_of`."""
     r, n_slots, first_lower = index[SIZE], index[N_SLOTS], index[FIRST_LOWER]
     if index[DENSE] == 1:
         lu_solve(values[: r * r].reshape((r, r)), row_exchanges_of(index), x)
@@ -451,14 +452,14 @@ def solve(index, values, x):
 
 @merged
 def solve_rows(index, values, X, n):
-    """Replace the first n rows of X, each a right-hand side, by the solutions; for their order see `solve`."""
+    """Replace the first n rows of X, each a right-hand side, by the solutions; for the order of entries see `solve`."""
     for j in range(n):
         solve(index, values, X[j])
 
 
 @merged
 def solve_transposed(index, values, x):
-    """Replace x, in the order of columns_of, by the solution for the transposed matrix, in the order of rows_of."""
+    """Replace x, in the order of `columns_of`, by the solution for the transposed matrix, in the order of `rows_of`."""
     r = index[SIZE]
     if index[DENSE] == 1:
         A, pivots = values[: r * r].reshape((r, r)), row_exchanges_of(index)

@@ -1,4 +1,4 @@
-"""Choose independent rows of G, and rows g that make M + sum s g g^T invertible; find bounds of pivots."""
+"""Choose independent rows of the Jacobian G, and rows g that make M + sum s g g^T invertible; find bounds of pivots."""
 
 import math
 
@@ -7,7 +7,7 @@ from numba import types
 from twoloop.kernels.data.common import INTEGERS, MATRIX, VECTOR, compiled, f8, i8, kernel, merged
 from twoloop.kernels.linalg.dense import copy_matrix, largest_of, ldl_factor, ldl_solve, ldl_solve_rows
 
-# rounding error of a product of two rows, relative to the sum of squares of all entries times the number of rows
+# rounding error of the dot product of two rows, relative to (sum of squares of all entries) * (number of rows)
 ROUNDING_OF_SQUARES = 4.0 * 2.0**-52
 # a row is orthogonalised again if the squared norm of its orthogonal part is below this fraction of its squared norm
 REORTHOGONALISE_BELOW = 0.5
@@ -29,9 +29,9 @@ def _dot(x, y):
 
 @compiled
 def _orthogonalise(basis, n, remainder, components):
-    """Subtract from `remainder` its components along the first n rows of `basis`; return |remainder|^2.
+    """Subtract from `remainder` its components along the first n rows of `basis`, which are orthonormal.
 
-    The rows of `basis` are orthonormal. Add these components to `components`.
+    Add these components to `components`. Return the square of the norm of `remainder`.
     """
     for i in range(n):
         component = _dot(basis[i], remainder)
@@ -46,10 +46,10 @@ def _orthogonalise(basis, n, remainder, components):
 def select_rows(G, min_sine, basis, factors, kept):
     """Store in `kept` the indices of rows of G, each independent of the rows selected before; return their number.
 
-    A row is independent if the sine of its angle to the selected rows exceeds `min_sine`. Its orthogonal part is
-    computed by Gram-Schmidt orthogonalisation, which is repeated if most of the row is lost. On return, the rows of
-    `basis` are orthonormal, and the selected rows are the lower triangle `factors` times `basis`. Both arrays have one
-    row for each row that may be independent, and one more for scratch.
+    A row is independent if the sine of its angle to the selected rows exceeds `min_sine`. Its part orthogonal to these
+    is computed by Gram-Schmidt orthogonalisation, which is repeated if this part is small. On return, the rows of
+    `basis` are orthonormal, and the matrix of selected rows is the lower triangle `factors` times `basis`. Both arrays
+    have one row for each row that may be independent, and one more for scratch.
     """
     n_kept = 0
     for k in range(len(G)):
@@ -81,7 +81,7 @@ def independent_rows(G, min_sine, basis, factors, kept):
 
 @merged
 def _fill_coefficients(n, basis, factors, row, coefficients):
-    """Store the `coefficients` (n) of the combination of the n selected rows that is nearest to `row`."""
+    """Store the `coefficients` (n) of the combination of the n rows from `select_rows` that is nearest to `row`."""
     for k in range(n):
         coefficients[k] = _dot(basis[k], row)
     for k in range(n - 1, -1, -1):
@@ -94,7 +94,7 @@ def _fill_coefficients(n, basis, factors, row, coefficients):
 def norm_of_inverse(factors, n, column):
     """Return the Frobenius norm of the inverse of the lower triangle `factors`, of n rows; `column` is scratch.
 
-    With the factors of independent rows of G, this norm times |b| bounds the solution of least norm of G x = b.
+    If `factors` belong to independent rows G, this norm times |b| bounds the shortest solution x of G x = b.
     """
     total = 0.0
     for j in range(n):
@@ -109,10 +109,10 @@ def norm_of_inverse(factors, n, column):
 
 @kernel(types.boolean(MATRIX, INTEGERS, f8, MATRIX, MATRIX, MATRIX, INTEGERS, MATRIX, VECTOR), vectorized=True)
 def express_other_rows(rows, order, min_sine, chosen_rows, basis, factors, kept, coefficients, norms):
-    """Return whether the rows order[:n] are independent; if so, express the other rows as combinations of these.
+    """Return False if the rows order[:n] are dependent; else express other rows as combinations of these.
 
-    n is the number of rows of `chosen_rows`, which receives the rows order[:n]. Row i of `coefficients` receives the
-    coefficients, by least squares, of row order[n + i] in terms of these rows; `norms` receives the norms of `rows`.
+    `order`: indices in `rows`; n: number of rows of `chosen_rows`, which receives the rows order[:n]. Row i of
+    `coefficients` receives those of the combination nearest to row order[n + i]; `norms` receives the norms of `rows`.
     For the other arguments see `select_rows`.
     """
     n = len(chosen_rows)
@@ -130,9 +130,9 @@ def express_other_rows(rows, order, min_sine, chosen_rows, basis, factors, kept,
 
 @kernel(types.boolean(MATRIX, f8, MATRIX), vectorized=True)
 def singular_values_exceed(rows, ratio, gram):
-    """Return whether all singular values of the matrix `rows` exceed `ratio` times the largest one, s.
+    """Return True if all singular values of a matrix A = `rows` certainly exceed `ratio` times the largest one, s.
 
-    This holds if rows rows^T - (ratio s)^2 I is definite; the Frobenius norm (at least s) replaces s. `gram`: scratch.
+    This is so if A A^T - (ratio s)^2 I is definite; the Frobenius norm (at least s) replaces s. `gram` is scratch.
     """
     n, total = len(rows), 0.0
     for i in range(n):
@@ -146,22 +146,22 @@ def singular_values_exceed(rows, ratio, gram):
 
 BOUND_ROUNDING = 1e-12  # largest rounding error of a pivot, relative to the bound that the pivot is compared with
 NOT_DEFINITE, STAYS_SINGULAR = -1, -2  # codes: M is not positive definite; no added rows make M invertible
-TINY = 1e-300  # divisor that replaces zero
+TINY = 1e-300  # replaces zero as a divisor
 # If the ratio of the smallest to the largest eigenvalue of M exceeds SIMILAR_EIGENVALUES, no term s g g^T is added to
-# M, and the pivots of S = G M^-1 G^T decide which rows are independent. A row with a pivot above INDEPENDENT is: its
-# part orthogonal to previous rows is at least 3e-9 = sqrt(INDEPENDENT * SIMILAR_EIGENVALUES) of its norm. A row is
-# dependent if this part is at most DEPENDENT of its norm. Otherwise the decision is uncertain, and made differently
+# M, and pivots of S = G M^-1 G^T, scaled to a diagonal of 1, decide whether a row of G is independent of previous rows:
+# it is if its pivot exceeds INDEPENDENT. Then its part orthogonal to them is at least 3e-9 of its norm, the square root
+# of INDEPENDENT * SIMILAR_EIGENVALUES. If this part is at most DEPENDENT times its norm, the row is dependent. If
+# neither holds for some row, `select_rows` decides
 SIMILAR_EIGENVALUES, INDEPENDENT, DEPENDENT = 1e-7, 1e-10, 1e-10
 # A redundant row is a combination of independent rows. If the coefficient of an independent row in it (rows scaled to
 # norm 1) exceeds this limit, the two rows are exchanged. This multiplies the volume that the independent rows span by
 # the coefficient: the rows are farther from becoming dependent, as at each dead centre of the slider-crank with two
 # rods. The limit exceeds 1, because equal coefficients of magnitude 1 are common, and must not lead to exchanges
 MAX_COEFFICIENT = 1.5
-# if the ratio of two coefficients is at most this, they count as equal, and the first row is chosen: in symmetrical
+# if the ratio of two coefficients is at most this, they count as equal, and the first row is exchanged: in symmetrical
 # mechanisms, rounding would otherwise choose among many equal coefficients, differently at each start
 TIE_RATIO = 1.01
-# an entry counts as zero up to this fraction of the largest entry of its row: a rounded start makes zeros this large
-ZERO_ENTRY = 1e-12
+ZERO_ENTRY = 1e-12  # an entry counts as zero up to this fraction of the largest in its row: the start may be rounded
 
 
 def workspace_size(n_rows: int, n: int) -> int:
@@ -190,7 +190,7 @@ def _factor_and_count_negative(A):
 
 @compiled
 def _eigenvalue_bounds(mass):
-    """Return a lower and an upper bound of the eigenvalues of M, by Gershgorin's circles."""
+    """Return a lower and an upper bound of the eigenvalues of the mass matrix, by Gershgorin's circles."""
     smallest, largest = math.inf, 0.0
     for i in range(len(mass)):
         row_sum = 0.0
@@ -202,7 +202,7 @@ def _eigenvalue_bounds(mass):
 
 @compiled
 def _count_weak_eigenvalues(mass, weak_ratio, A):
-    """Return the number of eigenvalues of M below b, and store the factors of M - b I in A.
+    """Return the number of eigenvalues of the mass matrix M below a limit b, and store the factors of M - b I in A.
 
     b is `weak_ratio` times an upper bound on the largest eigenvalue.
     """
@@ -215,7 +215,7 @@ def _count_weak_eigenvalues(mass, weak_ratio, A):
 
 @merged
 def _sort_rows_by_entries(G, order, counts):
-    """Store in `order` the indices of the rows of G, sorted by number of entries, and in `counts` these numbers."""
+    """Sort the rows of G by their numbers of nonzero entries: store indices in `order`, and the numbers in `counts`."""
     for k in range(len(G)):
         count, i, zero = 0.0, k, ZERO_ENTRY * largest_of(G[k])
         for j in range(G.shape[1]):
@@ -228,7 +228,7 @@ def _sort_rows_by_entries(G, order, counts):
 
 @merged
 def _removes_weak_eigenvalue(A, g, scale, x):
-    """Return whether adding scale g g^T to a matrix with the factors A reduces its number of negative eigenvalues.
+    """Return True if adding scale * g g^T to a matrix with the factors A reduces its number of negative eigenvalues.
 
     This is so if the determinant changes its sign. `x` is scratch.
     """
@@ -243,10 +243,11 @@ def _removes_weak_eigenvalue(A, g, scale, x):
 
 @merged
 def _add_rows_to_mass(mass, G, weak_ratio, scale, A, x, order, added):
-    """Add scale g g^T to M in place, for rows g of G, until all eigenvalues of M are large enough.
+    """Add scale * g g^T to the mass matrix M, for some rows g of G, until all its eigenvalues are large enough.
 
-    An eigenvalue is too small if it is less than `weak_ratio` times the largest one. Rows are tried in the sequence
-    `order`, where -1 replaces an added index. Store added indices in `added`; return their number, or STAYS_SINGULAR.
+    An eigenvalue is too small if it is less than `weak_ratio` times the largest one. Rows are tried in the sequence of
+    the indices in `order`, where -1 replaces those of added rows. Store these in `added`; return their number, or
+    STAYS_SINGULAR if no row removes a small eigenvalue.
     """
     n_added = 0
     while _count_weak_eigenvalues(mass, weak_ratio, A) > 0:
@@ -279,10 +280,10 @@ def _list_rows(is_kept, kept):
 
 @compiled
 def _exchange_rows(C, is_kept, kept):
-    """Exchange an independent row with a redundant row in which its coefficient exceeds MAX_COEFFICIENT.
+    """Exchange independent rows with redundant rows until no coefficient exceeds MAX_COEFFICIENT.
 
-    C[i, k] is the coefficient of the independent row k in the redundant row i, all rows scaled to norm 1; `is_kept` is
-    1 for independent rows. Each exchange multiplies the volume that the independent rows span by the coefficient.
+    Redundant row i is the sum over k of C[i, k] times independent row k, if all rows are scaled to norm 1; `is_kept` is
+    1 for independent rows, else 0. Each exchange multiplies the volume that independent rows span by the coefficient.
     Store the indices of the independent rows in `kept`, and return their number.
     """
     n = len(C)
@@ -298,7 +299,7 @@ def _exchange_rows(C, is_kept, kept):
                     largest, leaving, entering = coefficient, k, i
         if leaving < 0:
             break
-        # solve the equation of the entering row for the leaving row; substitute the result in the other redundant rows
+        # solve the equation of the entering (redundant) row for the leaving (independent) row; substitute it elsewhere
         inverse = 1.0 / C[entering, leaving]
         is_kept[leaving], is_kept[entering] = 0, 1
         for k in range(n):
@@ -315,9 +316,9 @@ def _exchange_rows(C, is_kept, kept):
 
 @compiled
 def _fill_scaled_products(mass, G, factors, solved, S, sizes):
-    """Store in S the upper triangle of G M^-1 G^T, scaled to a diagonal of 1; return whether M is definite.
+    """Store in S the upper triangle of G M^-1 G^T, scaled to a diagonal of 1; return False if M is not definite.
 
-    `sizes` receives the factors that scale the rows, or 0 for a row of zeros. `factors` and `solved` are scratch.
+    `sizes` receives the factors that scale the rows of G, or 0 for rows of zeros. `factors` and `solved` are scratch.
     """
     n_rows, n = G.shape
     copy_matrix(mass, factors)
@@ -343,9 +344,9 @@ def _fill_scaled_products(mass, G, factors, solved, S, sizes):
 
 @compiled
 def _find_dependent_rows(S, G, sizes, U, C, remainder, is_kept):
-    """Set `is_kept` to 0 for each row that depends on previous rows, else to 1; return the largest 1 / pivot.
+    """Set `is_kept` to 0 for each row of G that depends on previous rows, else to 1; return max(1 / pivot) of S.
 
-    Return 0 if it is uncertain whether a row is dependent. For S and `sizes` see `_fill_scaled_products`. C[i, k]
+    If it is uncertain whether a row is dependent, return 0. For S and `sizes` see `_fill_scaled_products`. C[i, k]
     receives the coefficient of row k in a dependent row i, both scaled to norm 1. U and `remainder` are scratch.
     """
     n_rows, largest_inverse = len(S), 1.0
@@ -386,18 +387,18 @@ def _find_dependent_rows(S, G, sizes, U, C, remainder, is_kept):
 @merged
 def _fill_shifted(S, kept, shift, shifted):
     for i in range(len(shifted)):
-        for k in range(i, len(shifted)):  # only the upper triangle of `shifted` is used
+        for k in range(i, len(shifted)):  # `ldl_factor` uses only the upper triangle
             shifted[i, k] = S[kept[i], kept[k]]
         shifted[i, i] -= shift
 
 
 @compiled
 def _first_bound_below_pivots(S, kept, n_kept, largest_inverse, bounds, scratch):
-    """Return the index of the first of `bounds` that is below all pivots of the rows `kept`; bounds.size if none is.
+    """Return the index of the first of `bounds` that is below all pivots of S; bounds.size if none is.
 
-    Pivots are relative to the diagonal entries of G M^-1 G^T. No pivot is below the smallest eigenvalue of S, which is
-    scaled to a diagonal of 1; and this eigenvalue exceeds a bound b if S - b I is positive definite. The eigenvalue is
-    at most the smallest pivot of S, 1 / `largest_inverse` (0: unknown), so that larger bounds need no test.
+    S is the matrix G M^-1 G^T of the rows `kept` of G, scaled to a diagonal of 1. No pivot is below the smallest
+    eigenvalue of S, and this eigenvalue exceeds a bound b if S - b I is positive definite. It is at most the smallest
+    pivot, 1 / `largest_inverse` (0: unknown), so that larger bounds need no test.
     """
     shifted = scratch[: n_kept * n_kept].reshape((n_kept, n_kept))
     if largest_inverse == 0.0:
@@ -436,13 +437,13 @@ def _select_dependent_rows(G, min_sine, basis, factors, coefficients, C, kept, i
 
 @kernel(i8(MATRIX, MATRIX, f8, f8, VECTOR, VECTOR, INTEGERS), vectorized=True)
 def choose_rows(original_mass, G, min_sine, weak_ratio, bounds, workspace, chosen):
-    """Choose the independent rows of G, and rows that make M (`original_mass`) invertible; return an index or a code.
+    """Choose the independent rows of G, and rows g for which M + sum s g g^T is invertible (M: `original_mass`).
 
     Rows of G are selected as in `select_rows` with `min_sine`, then exchanged as in `_exchange_rows`. Rows are added to
     M if M has eigenvalues below `weak_ratio` times the largest; weak_ratio = 0: no rows are added. `chosen`, of
     2 + 3 n_rows numbers, receives the number of independent rows, the number of added rows, and the indices of both in
-    two lists of length n_rows. `workspace` is scratch, but workspace[0] receives the factor s of the added s g g^T.
-    Return the result of `_first_bound_below_pivots`, or STAYS_SINGULAR. See generate/elimination.py.
+    two lists of length n_rows. `workspace` is scratch, but workspace[0] receives s. Return the result of
+    `_first_bound_below_pivots`, or a code: STAYS_SINGULAR or NOT_DEFINITE. See generate/elimination.py.
     """
     n_rows, n = G.shape
     n_max = min(n_rows, n) + 1
@@ -464,7 +465,7 @@ def choose_rows(original_mass, G, min_sine, weak_ratio, bounds, workspace, chose
         largest_inverse = _find_dependent_rows(S, G, sizes, U, C, x, order)
     if largest_inverse > 0.0:
         chosen[0] = n_kept = _exchange_rows(C, order, kept)
-        largest_inverse = largest_inverse if n_kept == n_rows else 0.0  # 0: unknown, because rows may be exchanged
+        largest_inverse = largest_inverse if n_kept == n_rows else 0.0  # 0: unknown, rows may have been exchanged
         first_bound = _first_bound_below_pivots(S, kept, n_kept, largest_inverse, bounds, scratch)
         if first_bound < bounds.size:  # the chosen rows are certainly independent
             return first_bound
