@@ -144,7 +144,7 @@ def solve_by_reduced_mass(f, w, r, c, a):
 
 @merged
 def multipliers_by_elimination(f, w, r, a, lam):
-    """Store in lam the multipliers of the independent rows of G, from the dependent equations of G^T lam = r - M a."""
+    """Store in lam the multipliers of independent rows, by the rows of G^T lam = r - M a for dependent coordinates."""
     rows, columns, z = rows_of(w.index_v), columns_of(w.index_v), w.z
     for k in range(columns.size):
         column = columns[k]
@@ -241,8 +241,8 @@ def solve_by_schur_complement(f, w, r, c, a):
             a[j] -= M_inverse_G[i, j] * w.z[i]
 
 
-# the augmented form is used if there are at least MIN_ROWS constraints (it is fastest from 7 constraints), and at least
-# MIN_ROWS degrees of freedom or, unless M is diagonal, MIN_COORDINATES coordinates (it is fastest from about 30)
+# the augmented form is used if there are at least MIN_ROWS constraints (measured: it is fastest from 7), and at least
+# MIN_ROWS degrees of freedom or, unless M is diagonal, MIN_COORDINATES coordinates (measured: fastest from about 30)
 MIN_ROWS = 8
 MIN_COORDINATES = 32
 
@@ -379,7 +379,7 @@ def solve(f, w, r, c, a):
 
 @merged
 def multipliers(f, w, r, a, lam):
-    """Store in lam the multipliers of independent rows that belong to `a`, the last solution; keep other entries."""
+    """Store the multipliers of independent rows for `a`, the last solution, in lam; leave the other entries of lam."""
     if f.form == NULL_SPACE:
         multipliers_by_elimination(f, w, r, a, lam)
     else:

@@ -61,12 +61,12 @@ class _PartSupports:
         self.lone_bodies = lone_bodies
         self.parts = _DisjointSets(n_bodies)
         self.is_grounded = [False] * n_bodies
-        self.hubs_by_part: list[set[int]] = [set() for _ in range(n_bodies)]  # index: smallest body of a part
+        self.hubs_by_part: list[set[int]] = [set() for _ in range(n_bodies)]  # supporting hubs, by a part's first body
         # for each hub: one body of each part that the hub supports or has supported
         self.supported_bodies: dict[int, list[int]] = {hub: [] for hub in hubs}
 
     def can_eliminate(self, joint: int) -> bool:
-        """Return True if one of the parts that the joint connects has no support, or if the joint involves no hub."""
+        """Return True if the joint involves no hub, or if one of its parts has no support and it has no lone body."""
         bodies = self.joints[joint]
         parts = {self.parts.find(body) for body in bodies if body not in self.hubs}
         if not bodies & self.lone_bodies and any(not self.is_grounded[p] and not self.hubs_by_part[p] for p in parts):

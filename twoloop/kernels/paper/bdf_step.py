@@ -84,7 +84,7 @@ def _history_views(memory, n):
 
 @kernel(COMMIT)
 def commit_bdf(f, w, options, memory, tolerances, accepted):
-    """Set ORDER to NEXT_ORDER; if the step was accepted, also store its trial differences as the new history."""
+    """Set the order of the next step; if the last step was accepted, its trial differences become the history."""
     differences, trial, _, _, _ = _history_views(memory, w.Q.size)
     has_trial = memory[HAS_TRIAL]
     memory[HAS_TRIAL] = 0.0

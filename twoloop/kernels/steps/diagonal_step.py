@@ -313,7 +313,8 @@ MAX_RATIO_BY_ONE_JUMP = 0.174
 def _filter_errors(f, w, options, memory, h, e_q, e_v):
     """Remove stiff components: replace (e_q, e_v) by (I - z J)^-1 (e_q, e_v), z = h gamma, using the last factors.
 
-    J is the Jacobian of velocities and accelerations by (q_i, v_i). Only the first n_dof entries of e_q and e_v change.
+    J is the Jacobian of velocities and accelerations by (q_i, v_i). The errors are the first n_dof entries of e_q and
+    e_v (n_q); the other entries are scratch.
     """
     z = h * gamma_of(options)
     n_dof = w.independent.size
@@ -493,7 +494,11 @@ def commit_diagonal(f, w, options, memory, tolerances, accepted):
 
 @kernel(ATTEMPT, vectorized=True)
 def diagonal_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """Attempt a step: solve for the stages one after another; the last stage is the end of the step."""
+    """Attempt a step: solve for one stage after another.
+
+    The step ends at the last stage or, if `options` say so, at the result of the embedded formula, see
+    `diagonal_options`.
+    """
     s = int(options[at.DIAGONAL_OFFSET])
     begin = at.DIAGONAL_OFFSET + 1
     A = options[begin : begin + s * s].reshape((s, s))

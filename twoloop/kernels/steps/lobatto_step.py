@@ -56,7 +56,7 @@ from twoloop.kernels.linalg.dense import copy
 START_CONTRACTION = 0.12  # contraction (ratio of errors by a sweep) that guesses of the first step size aim at
 MAX_GUESSES = 4  # largest number of guesses of the first step size
 FACTOR_AFTER_DIVERGENCE = 0.6  # ratio of the next step size to the size of a step whose iteration did not converge
-SAFETY = 0.75  # factor on the step size for which the estimated error would equal the tolerance
+SAFETY = 0.75  # safety factor on the step size for which the estimated error would equal the tolerance
 MAX_LIMITED = 24.0  # another method takes over at this value of LIMITED, which counts steps limited by convergence
 MIN_CURVATURE = 0.1  # below this value of CURVATURE (in tolerances), accelerations hardly vary within a step
 N_PIVOT_PARTS = 4  # number of equal parts of a step; the smallest pivot of C_q is computed where two parts meet

@@ -126,9 +126,10 @@ def _solve_stages(f, w, options, memory, t, h, tolerances, q, v, A_stage):
 
 @compiled
 def _filter_errors(f, w, options, memory, h, e_q, e_v):
-    """Remove stiff components from errors: replace (e_q, e_v) by (I - z J)^-1 (e_q, e_v), with z = h gamma0.
+    """Remove stiff components from errors: replace (e_q, e_v) by (I - z J)^-1 (e_q, e_v), z = h gamma0 (see GAMMA0).
 
-    J is the Jacobian of velocities and accelerations by (q_i, v_i). Only the first n_dof entries of e_q and e_v change.
+    J is the Jacobian of velocities and accelerations by (q_i, v_i). The errors are the first n_dof entries of e_q and
+    e_v (n_q); the other entries are scratch.
     """
     s = int(options[STAGES])
     m = w.independent.size

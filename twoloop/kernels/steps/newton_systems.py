@@ -209,7 +209,7 @@ def _fill_jacobians_from_tangents(f, w, memory, s, t, q, v):
     n = q.size
     m = w.independent.size
     w.n_jacobians += 1
-    # earlier factors are no longer needed: their storage receives K (later D), T^T M T and products A T
+    # earlier factors are no longer needed: their storage receives K (later D), T^T M T, and products such as K T
     K, R = as_matrix(matrix_storage(w, n, at.FILTER), n), as_matrix(matrix_storage(w, n, at.SYSTEMS), n)
     code = fill_tangent_by_q(f, w, t, q, v, n - 1, vector(memory, s, n, at.Q_MOVED), K, R)
     if code != DONE:
@@ -300,7 +300,7 @@ def _factor_dense_matrix(w, memory, s, index, z, matrix):
 
 @compiled
 def _filter_error_dense(w, options, memory, s, h, e_q, e_v):
-    """Filter e_v (n_dof) as `filter_error` does, by the dense factors of I - z^2 J_q - z J_v with z = h gamma0."""
+    """Filter e_v (n_dof) as `filter_error` does, by the dense factors from `factor_filter`."""
     n = w.Q.size
     m = e_q.size
     gamma0 = options[newton_options_index(s) + at.GAMMA0]
@@ -492,7 +492,7 @@ def _solve_banded_system(f, w, b, numbers, pivots, substitute, X, x):
 
 @compiled
 def _filter_error_banded(f, w, options, memory, s, h, e_q, e_v):
-    """Filter e_v[:n_dof] as `filter_error` does, by banded factors; the other entries of e_v (n_q) are scratch."""
+    """Filter e_v[:n_dof] as `filter_error` does, by the banded factors; the other entries of e_v (n_q) are scratch."""
     n = w.Q.size
     b = f.bandwidth
     z = h * options[newton_options_index(s) + at.GAMMA0]
@@ -708,7 +708,7 @@ def _fill_sparse_right_side(f, w, r, right):
 
 @compiled
 def _filter_error_sparse(f, w, options, s, h, e_q, e_v):
-    """Filter e_v (n_q) as `filter_error` does, by sparse factors."""
+    """Filter e_v (n_q) as `filter_error` does, by the sparse factors from `factor_filter`."""
     _, _, K, _, _, _ = _sparse_derivative_views(f, w)
     _, _, _, _, right, y = _sparse_scratch(f, w)
     z, n = h * options[newton_options_index(s) + at.GAMMA0], y.size
@@ -754,7 +754,7 @@ def factor_filter(f, w, options, memory, s, h):
 
 @compiled
 def factor_systems(f, w, options, memory, s, h):
-    """Factor Newton's matrix I - z^2 J_q - z J_v for z = h gamma0 and for z = h times eigenvalues of the tableau."""
+    """Factor I - z^2 J_q - z J_v for `filter_error`, and with z = h l for each eigenvalue l of A; return a code."""
     offset = newton_options_index(s)
     n_systems, n_real = count_systems(options, s), int(options[offset + at.N_REAL])
     code = factor_filter(f, w, options, memory, s, h)
@@ -821,7 +821,8 @@ def solve_system(f, w, options, memory, s, k, x):
 def filter_error(f, w, options, memory, s, h, e_q, e_v):
     """Remove stiff components from e_v: replace it by (I - z^2 J_q - z J_v)^-1 (e_v + z J_q e_q), with z = h gamma0.
 
-    J_q, J_v: derivatives of accelerations; e_q, e_v (n_q): errors of q and v, in their first n_dof entries.
+    J_q, J_v: derivatives of accelerations by q_i and v_i; gamma0: a number of the tableau, see GAMMA0. The errors
+    of q and v are the first n_dof entries of e_q and e_v (n_q); the other entries are scratch.
     """
     m = w.independent.size
     if f.form == FIXED_ORDER:
