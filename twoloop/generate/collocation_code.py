@@ -466,7 +466,7 @@ class CollocationCode:
             v0, a0 = (num.load(num.pointer(state, i), m * self.n) for m in (1, 2))
             of_v = self._weighted_accelerations(emit, tables().velocities, a0, work, i)
             store_lanes(emit, emit.fma(h, of_v, emit.broadcast(v0)), num.pointer(work, k * LANES), self.spectrum_offset)
-        offset.add_incoming(integer(self.spectrum_offset), builder.block)  # free until Legendre coefficients are stored
+        offset.add_incoming(integer(self.spectrum_offset), builder.block)  # memory that is free until `_estimate_error`
         builder.jump(loop)
         builder.position_at_end(after)
 

@@ -466,7 +466,7 @@ def _choice_at(system: ConstrainedSystem, t: float, q: Array) -> PivotChoice:
 
 
 def generated_code(system: ConstrainedSystem, t0: float, q0: Array, check: Check = accept_traces) -> GeneratedCode:
-    """Return the cached code for a system and a start; `check` raises if calls of callbacks differ from their traces.
+    """Return code for a system and a start, cached or new; `check` raises if calls of callbacks differ from traces.
 
     Raise ValueError if code for the equations cannot be generated.
     """

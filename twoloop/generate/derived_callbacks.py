@@ -87,7 +87,7 @@ def _derive_programs(system: ConstrainedSystem, missing: Sequence[str], cache: T
 
 
 def _missing_derivatives(equations: Equations, missing: Sequence[str]) -> dict[str, dict[int, Affine]]:
-    """Return the expressions of missing "jacobian" and "gamma" (both kinds), by index in the flattened array."""
+    """Return expressions of missing "jacobian" and "gamma" (with non-holonomic rows), by index in the flat array."""
     system = equations.system
     gamma: dict[int, Affine] = {}
     for kind, first in (("gamma", 0), ("nonholonomic_gamma", system.n_c)):
@@ -157,7 +157,7 @@ def has_exact_derivatives(system: ConstrainedSystem, t: float, q: Array, v: Arra
 
 
 def generic_states(states: Sequence[tuple[float, Array, Array]]) -> Array:
-    """Return rows [t, q, v] with the t and q of `states`, and random nonzero v as large as their sizes of q and v."""
+    """Return rows [t, q, v] with the t and q of `states`, and random nonzero v of a similar or larger size."""
     times, positions, velocities = (np.array(values, dtype=float) for values in zip(*states, strict=True))
     generic_v = np.array([sizes(q) for q in positions]) * _random_factors(*positions.shape)
     scale = max(1.0, float(np.abs(velocities).max()) / float(np.abs(generic_v).max()))

@@ -45,28 +45,29 @@ from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
 
-SINGULAR_MASS = 1e-10  # rows of G are added to M if its smallest eigenvalue is below this fraction of the largest
+SINGULAR_MASS = 1e-10  # rows of G are added to M if the smallest eigenvalue of M is below this fraction of the largest
 RANK_TOL = 1e-9  # a row of G is dependent if its part orthogonal to other rows is below this fraction of the row
 # a pivot of a row of G is measured relative to the pivot that the row has without the other rows. During a run, the
 # generated code accepts pivots down to about this fraction of the smallest pivot at the start
 PIVOT_FRACTION = 0.01
 # possible values of `PivotChoice.min_pivot`, the smallest accepted pivot; below the last, rounding errors dominate
 MIN_PIVOTS = 10.0 ** np.arange(-2, -9, -1)
-# min_pivot = MIN_PIVOTS[i] for the first i with START_LIMITS[i] <= smallest pivot at the start, else MIN_PIVOTS[-1]
+# the smallest accepted pivot is MIN_PIVOTS[i] for the first i with START_LIMITS[i] <= smallest pivot at the start; if
+# there is no such i, it is MIN_PIVOTS[-1]
 START_LIMITS = MIN_PIVOTS[:-1] / PIVOT_FRACTION
-# all rows of G are added to M on trial if pivots at the start are so small that min_pivot is MIN_PIVOTS[i], i at least
+# all rows of G are added to M on trial if the index of the smallest accepted pivot in MIN_PIVOTS is at least
 # - MIN_INDEX_FEW, for at most N_FEW_COORDINATES coordinates
 # - MIN_INDEX_FEW_SINGULAR, if M is also singular: Euler parameters lose two digits even in sound models
 # - MIN_INDEX_MANY (plus one if M is singular), for more coordinates, because the code gets longer
 N_FEW_COORDINATES = 24
 MIN_INDEX_FEW, MIN_INDEX_FEW_SINGULAR, MIN_INDEX_MANY = 4, 5, 6
-ADDED_SIZE = 16.0  # if s G^T G is added to M, approximate ratio of its largest entry to the largest entry of M
+ADDED_SIZE = 16.0  # if s G^T G is added to M, its largest entry is about this many times the largest entry of M
 MAX_PIVOT_RATIO = 1e5  # solutions are refined if a diagonal entry of M with added rows exceeds its pivot by this factor
 SCALE_STEP = 1024.0  # scales of added rows differ by powers of this large number: then most starts have equal scales
 DISPLACEMENT = 0.2  # displacement of coordinates (m or rad) to a position where no entry of M and G is zero by chance
 MIN_GAIN = 2  # rows added to M on trial are kept if the index of min_pivot in MIN_PIVOTS falls by at least this
-# dependent coordinates are eliminated only if G has at least this number of rows per coordinate: otherwise the linear
-# system for the multipliers is smaller
+# dependent coordinates are eliminated only if there are at least this many constraints per coordinate: otherwise the
+# linear system for the multipliers is smaller
 MIN_ROW_RATIO = 2.0 / 3.0
 
 PivotBlocks = tuple[tuple[tuple[int, ...], tuple[int, ...]], ...]
@@ -210,7 +211,7 @@ class PivotChooser:
         return index if index >= 0 and chosen[2 : 2 + chosen[0]].tolist() == list(choice.rows) else -1
 
     def _try_added_rows(self, choice: PivotChoice, factors: Array, mass: Array, G: Array, index: int) -> PivotChoice:
-        """Return a choice that adds all independent rows to M if its smallest pivot is much larger, else `choice`.
+        """If adding all independent rows to M makes the smallest pivot much larger, return this choice, else `choice`.
 
         `factors`: factors on the scales s of all rows. `index`: index of `choice.min_pivot` in MIN_PIVOTS. A body may
         have little inertia about its joints, such as a rod with a mass in its middle. Then rows are nearly dependent in
@@ -289,7 +290,7 @@ MAX_COST_RATIO = 0.75
 
 
 class Elimination:
-    """Symbolic elimination of the equations of a system, with the rows G = [C_q; A].
+    """Symbolic elimination of the equations of a system, with the rows G = [C_q; A] of all constraints.
 
     choice : the decisions that depend on numbers.
     equations : traced equations of the system; their graph is extended.
@@ -348,7 +349,7 @@ class Elimination:
         return Program(self.graph, {"": []}, conditions)
 
     def _matrix(self) -> dict[tuple[int, int], Affine]:
-        """Return the nonzero entries of [M G^T; G 0] with the independent rows of G, and with rows added to M."""
+        """Return the nonzero entries of [M G^T; G 0] with the independent constraint rows G, and rows added to M."""
         n = self.system.n_q
         matrix = {(i, j): self.mass[i, j] for i in range(n) for j in range(n) if not is_zero(self.mass[i, j])}
         for i, j in matrix:
@@ -424,7 +425,7 @@ class Elimination:
         return Program(self.graph, {"r": force, "c": [x if k in used else self.zero for k, x in enumerate(gamma)]})
 
     def _accelerations(self, v: Sequence[Affine]) -> tuple[list[Affine], list[tuple[Affine, Affine]]]:
-        """Return one list (accelerations, multipliers of the independent rows) at velocities v, and its conditions."""
+        """Return accelerations and multipliers (independent rows) at velocities v in one list, and their conditions."""
         return self._solve(*self._right_sides(v))
 
     def _expand_to_all_rows(self, independent: Sequence[Affine]) -> list[Affine]:
@@ -436,7 +437,7 @@ class Elimination:
 
     @cached_property
     def position_errors(self) -> Program:
-        """Return the program for the right sides "c" of position corrections: -C; 0 in redundant rows and in A."""
+        """Return the program for right sides "c" of position corrections: -C; 0 in redundant and non-holonomic rows."""
         errors = [*(-violation for violation in self._callback_terms("constraint")), *[self.zero] * self.system.n_a]
         return Program(self.graph, {"c": self._expand_to_all_rows([errors[k] for k in self.choice.rows])})
 

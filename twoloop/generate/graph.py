@@ -192,7 +192,7 @@ def rounded(value: float) -> Any:
     if type(value) is Parameter:
         return rounded(value.scale), value.powers
     value = float(value)
-    scaled = 4097.0 * value  # 2**12 + 1: Dekker's splitting
+    scaled = 4097.0 * value  # Dekker's splitting: the factor 2**12 + 1 makes the difference below round to 41 bits
     return scaled - (scaled - value)
 
 

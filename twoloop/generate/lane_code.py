@@ -355,7 +355,7 @@ def orientation_change_mask(emit: LaneEmitter, before: SparseRows, after: Sparse
 
 Array = NDArray[np.float64]
 
-WEIGHT_ROUNDING = 1e-13  # weights up to this size count as zero, because they are rounding errors of products like A A
+WEIGHT_ROUNDING = 1e-13  # weights up to this size count as zero: they are rounding errors of products such as A @ A
 
 # Butcher tableau A, b, c of an explicit Runge-Kutta method (first stage: the state), and weights of two error estimates
 Tableau = tuple[Array, Array, Array, Array, Array]

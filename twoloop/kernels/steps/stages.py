@@ -137,9 +137,9 @@ def estimate_end_error(tolerances, options, h, state, new_state, A_stage):
 # of the Butcher tableau, A = T diag(eigenvalues) T^-1 with the eigenvectors T: its real and imaginary part, its row of
 # T^-1 and its column of T (of both, s real parts, then s imaginary parts)
 (
-    N_REAL,  # number of real eigenvalues of A
-    N_PAIRS,  # number of pairs of conjugate complex eigenvalues of A
-    GAMMA0,  # first real eigenvalue of A; if there is none, smallest magnitude of an eigenvalue
+    N_REAL,  # number of real eigenvalues of the matrix A of the Butcher tableau
+    N_PAIRS,  # number of pairs of conjugate complex eigenvalues of the matrix A of the Butcher tableau
+    GAMMA0,  # first real eigenvalue of the tableau's A; if there is none, smallest magnitude of an eigenvalue
     TESTS_VELOCITIES,  # 1: the error test compares velocity errors; 0: their effects by `velocity_error`
     N_EIGEN_SCALARS,
 ) = range(5)

@@ -86,7 +86,7 @@ KIND, BEGIN, END, MORE_FIRST, _, MORE_SECOND, _, N_GROUP = range(8)
 
 
 def memory_size(order: int, n_q: int, n_rows: int, n_nodes: int, early: int, late: int) -> int:
-    """Return the length of `memory`; n_rows: number of constraints; n_nodes, early, late: N_NODES and both widths."""
+    """Return the length of `memory`; n_rows: number of constraints; n_nodes, early, late: N_NODES, EARLY_WIDTH etc."""
     n_orders = order + 2
     scratch = n_orders * (n_nodes + 2 * early + 2 * late) + early + late + n_q + n_rows
     return N_MEMORY_SCALARS + 2 * (order + 1) * n_q + scratch + n_q
@@ -171,9 +171,9 @@ def _store_sums(options, sums, scale, values, out):
 
 @compiled
 def start_operations(options, table, values, z, x, y):
-    """Store the Taylor coefficients of order 0 of z, x and y for all operations of a table.
+    """Store the Taylor coefficients of order 0 of a table of operations: results z, factors x, y of products.
 
-    z: results. x, y: the two series whose products give the next coefficients of z; for a product, its arguments.
+    Products of x and y give the next coefficients of z. If the operation is a product, x and y are its arguments.
     A pending product (its second factor depends on the accelerations) is set to zero.
     """
     groups = _integer_array(options, table + GROUPS)
@@ -213,10 +213,10 @@ def start_operations(options, table, values, z, x, y):
 
 @merged
 def _next_coefficients(options, table, K, values, z, x, y, x0, y0, total):
-    """Store the Taylor coefficients of order K > 0 of z, x and y (see `start_operations`) for operations of a table.
+    """Store the Taylor coefficients of order K > 0 of a table of operations: results z, factors x, y of products.
 
-    x0 and y0 are the coefficients of order 0; `total` is the result of `sum_of_products` for order K. The second factor
-    of a pending product has no coefficient of order K yet: the term with this coefficient is left out.
+    x0, y0: coefficients of order 0. `total`: result of `sum_of_products` for order K. For x and y, see
+    `start_operations`. The second factor of a pending product has no coefficient of order K yet: its term is left out.
     """
     groups = _integer_array(options, table + GROUPS)
     inverse = 1.0 / K

@@ -26,7 +26,7 @@ from twoloop.kernels.steps.stages import INNER_TOL, block, vector
 SLOW_FACTOR = 10.0
 LONGEST_GAPS = 10.0  # largest assumed duration of a velocity error, relative to the longest time between evaluations
 STEPS_TO_DECAY = 10.0  # number of steps after which fast components of a velocity error count as decayed
-FAST_DURATION = 20.0  # a velocity error may change fast if its duration is below this many times z = h gamma
+FAST_DURATION = 20.0  # a velocity error may change fast if it lasts less than this times z (step size times gamma)
 OUTDATED_CHANGE = 0.3  # the Jacobian J counts as outdated if its relative change exceeds this
 
 
