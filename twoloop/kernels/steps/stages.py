@@ -13,7 +13,7 @@ from twoloop.kernels.control.step_size import commit_nothing
 from twoloop.kernels.data.common import ATTEMPT, Attempt, Step, allowed_error, compiled, inlined, kernel, merged
 from twoloop.kernels.data.indices import NOT_LOADED
 
-MAX_STEP_RATIO = 3.0  # the previous step predicts the stages of a step that is at most this many times as long
+MAX_STEP_RATIO = 3.0  # a step predicts the stages of the next step if the next step is at most this many times as long
 # Richardson's error estimate misses a force that jumps near an end of a step. So the error of a step is the larger of
 # Richardson's estimate and this factor times `estimate_end_error`
 END_ERROR_WEIGHT = 0.01
@@ -140,7 +140,7 @@ def estimate_end_error(tolerances, options, h, state, new_state, A_stage):
     N_REAL,  # number of real eigenvalues of the matrix A of the Butcher tableau
     N_PAIRS,  # number of pairs of conjugate complex eigenvalues of the matrix A of the Butcher tableau
     GAMMA0,  # first real eigenvalue of the tableau's A; if there is none, smallest magnitude of an eigenvalue
-    TESTS_VELOCITIES,  # 1: the error test compares velocity errors; 0: their effects by `velocity_error`
+    TESTS_VELOCITIES,  # 1: the error test compares velocity errors with tolerances; 0: it uses `velocity_error` instead
     N_EIGEN_SCALARS,
 ) = range(5)
 
@@ -173,7 +173,7 @@ A_NEW, Q_MOVED, V_MOVED, E_Q, E_V, Q_MID, V_MID, A_MID, N_VECTORS = range(9)
 # - DERIVATIVE_Q: J_q. In banded storage: the band of K, rows of C_q and their null space. In diagonal_step.py: T^T K T
 # - DERIVATIVE_V: J_v. In banded storage: the band of D. In diagonal_step.py: T^T D T
 # - FILTER: factors of the real matrix with which error estimates are filtered
-# - SYSTEMS: two parts for each eigenvalue of A, with the factors of its complex matrix; in diagonal_step.py, T^T M T
+# - SYSTEMS: for each eigenvalue of the tableau's A, two parts: a complex matrix, factored. In diagonal_step.py: T^T M T
 DERIVATIVE_Q, DERIVATIVE_V, FILTER, SYSTEMS = range(4)
 
 

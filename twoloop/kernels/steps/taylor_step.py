@@ -378,7 +378,7 @@ TARGET_PREDICTION_ERROR = 0.3
 # as a rounding error, too, if it is at most MAX_NOISE allowed defects and NOISE_RATIO times the defect at NEAR_BEGIN
 MAX_NOISE, NOISE_RATIO = 1e4, 10.0
 NEAR_BEGIN = 1e-5  # time after the beginning of a step, relative to the step size, at which the series is still exact
-# the defect is checked at equidistant times within a step. At each attempt, they shift by this fraction of their
+# the defect is checked at equidistant times within a step. At each attempt, these times shift by this fraction of their
 # spacing. Multiples of the golden section have evenly distributed fractional parts: so no time is missed for long
 GOLDEN_SECTION = 0.6180339887498949
 MAX_DEFECT = 1e300  # replaces an infinite defect, which means that a function has no finite value within the step
