@@ -3,9 +3,9 @@
 M is the mass matrix, and G the constraint Jacobian. An independent row of G has a negative pivot: minus the squared
 norm of the part of the row that is orthogonal to previous rows, in the metric of M^-1. The squared norm of the row
 itself is the sum of contributions of the bodies. The ratio of the two squared norms is the squared sine of the angle
-between the row and the previous rows. For a redundant row, 0 replaces 1 / pivot, which removes the row from the
-solution without another program. If the smallest squared sine is 10^-k, solutions lose k digits, which refinement with
-M and G recovers.
+between the row and the previous rows. For a redundant row, 0 replaces 1 / pivot: the row does not influence the
+solution, and the program stays the same. If the smallest squared sine is 10^-k, solutions lose k digits, which
+iterative refinement with M and G recovers.
 
 The matrix M of a body may be singular, as it is with four Euler parameters. Then M + s g g^T replaces M for each row g
 of G that involves this body only; s is a positive number. Accelerations stay the same, because the constraint
@@ -158,7 +158,10 @@ def solve(program, values, stiffness, x, y):
 
 @compiled
 def add_terms_of_redundant_rows(program, jacobian, is_independent, stiffness, rhs, right):
-    """For each redundant row g of G that was added to M as s g g^T, add s c g^T to `right`; c: its entry in `rhs`."""
+    """For each redundant row g of G that was added to M as s g g^T, add s c g^T to `right`.
+
+    s is the row's number in `stiffness`, and c its right-hand side in `rhs`: its equation g a = c is not solved.
+    """
     n_q = program[N_COORDINATES]
     _, columns, _ = jacobian_entries_of(program)
     product_rows, first, second, _ = stiffening_products_of(program)

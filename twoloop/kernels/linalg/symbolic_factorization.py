@@ -66,7 +66,12 @@ class _PartSupports:
         self.supported_bodies: dict[int, list[int]] = {hub: [] for hub in hubs}
 
     def can_eliminate(self, joint: int) -> bool:
-        """Return True if the joint involves no hub, or if one of its parts has no support and it has no lone body."""
+        """Return True if a joint may be eliminated before the remaining hubs (bodies with many joints).
+
+        A part is a set of bodies that eliminated joints connect; the ground or hubs support it. The joint may be
+        eliminated if it involves no hub, directly or as a support of its parts. It may also be eliminated if one of its
+        parts has no support, unless it involves one of the `lone_bodies`.
+        """
         bodies = self.joints[joint]
         parts = {self.parts.find(body) for body in bodies if body not in self.hubs}
         if not bodies & self.lone_bodies and any(not self.is_grounded[p] and not self.hubs_by_part[p] for p in parts):
@@ -74,13 +79,13 @@ class _PartSupports:
         return not bodies & self.hubs and not any(self.hubs_by_part[p] for p in parts)
 
     def eliminate_joint(self, joint: int) -> None:
-        """Merge the parts that an eliminated joint connects, and update their supports."""
+        """Merge the parts (sets of connected bodies) that an eliminated joint connects, and update their supports."""
         bodies = self.joints[joint]
         is_grounded = len(bodies) == 1 or bool(bodies & self.lone_bodies)
         self._merge_parts((body for body in bodies if body not in self.hubs), is_grounded, bodies & self.hubs)
 
     def eliminate_hub(self, hub: int) -> None:
-        """Merge an eliminated hub and the parts that it supports, and update their supports."""
+        """Merge an eliminated hub (a body with many joints) and the parts that it supports; update their supports."""
         self.hubs.discard(hub)
         supported_bodies = self.supported_bodies.pop(hub)
         for body in supported_bodies:
@@ -88,7 +93,7 @@ class _PartSupports:
         self._merge_parts([hub, *supported_bodies], False, frozenset())
 
     def _merge_parts(self, bodies: Iterable[int], is_grounded: bool, hubs: AbstractSet[int]) -> None:
-        """Merge the parts of `bodies`; add `hubs` and, if `is_grounded`, the ground to the supports of the result."""
+        """Merge the parts that contain `bodies`; add `hubs` and, if `is_grounded`, the ground to their supports."""
         first, *others = bodies
         part = self.parts.find(first)
         for body in others:
@@ -390,7 +395,7 @@ def _columns_of_factors(n: int, low: Integers, high: Integers) -> list[Integers]
 
 @inlined
 def end_of_sections(program):
-    """Return the index of the end of a program's sections."""
+    """Return the index behind the sections of a program, where `newton_program` adds groups of columns."""
     begin = N_HEAD + 2 * program[N_PIVOTS] + 1 + program[N_OFF_DIAGONAL] + program[N_RUNS]
     return begin + 3 * (program[N_OF_MASS] + program[N_OF_JACOBIAN]) + 4 * program[N_STIFFENED]
 

@@ -115,7 +115,7 @@ SUDDEN_ERROR = 10.0  # a step with a larger estimated error by a jump of a force
 
 @kernel(ATTEMPT)
 def paper_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """Attempt a step as in Sects. 3.1-3.3 of the paper; estimate its error from a step of h and two of h/2."""
+    """Attempt a step as in Sects. 3.1-3.3 of the paper; estimate its error by comparison with two steps of h/2."""
     s, _, _, _, _, _ = tableau_of(options)
     n = w.Q.size
     q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]

@@ -352,7 +352,7 @@ def _store_weighted_sums(w, h, V_stage, A_stage, weights, factor, e_q, e_v):
 
 @compiled
 def _renew_derivatives(f, w, options, memory, t, h, new_state):
-    """Compute derivatives of accelerations at t and `new_state`; factor matrices for steps of size h; return a code."""
+    """Compute derivatives at t and `new_state`; factor Newton's matrices for steps of size h; return a code."""
     n = w.Q.size
     Q, V, F = vector(memory, 1, n, at.Q_MID), vector(memory, 1, n, at.V_MID), vector(memory, 1, n, at.A_MID)
     copy(new_state[:n], Q)
@@ -496,8 +496,7 @@ def commit_diagonal(f, w, options, memory, tolerances, accepted):
 def diagonal_step(f, w, options, memory, t, h, tolerances, state, new_state):
     """Attempt a step: solve for one stage after another.
 
-    The step ends at the last stage or, if `options` say so, at the result of the embedded formula, see
-    `diagonal_options`.
+    The step ends at the last stage or, if an option says so, at the result of the embedded formula.
     """
     s = int(options[at.DIAGONAL_OFFSET])
     begin = at.DIAGONAL_OFFSET + 1
@@ -538,7 +537,7 @@ def diagonal_step(f, w, options, memory, t, h, tolerances, state, new_state):
             return Attempt(code, np.inf, 0.0)
         copy(V, V_stage[j])
     copy(V, v1)
-    # `prediction_error` compares these positions, by the formula, with positions on the constraints
+    # `prediction_error` compares these positions, predicted by the formula, with positions on the constraints
     for m in w.dependent:
         q1[m] = q_bar[m] + h * A[s - 1, s - 1] * V[m]
     for m in w.independent:

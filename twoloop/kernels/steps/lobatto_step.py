@@ -61,8 +61,8 @@ MAX_LIMITED = 24.0  # another method takes over at this value of LIMITED, which 
 MIN_CURVATURE = 0.1  # below this value of CURVATURE (in tolerances), accelerations hardly vary within a step
 N_PIVOT_PARTS = 4  # number of equal parts of a step; the smallest pivot of C_q is computed where two parts meet
 MIN_PIVOT_RATIO = 0.4  # a singular position is near if a step reduces the smallest pivot of C_q below this fraction
-# with a smaller tolerance, another method takes over once a singular position was near: without this rule, five more
-# runs of the benchmark A02 (N-four-bar mechanism) end with wrong results
+# if the smallest tolerance is below this, another method takes over once a singular position was near. Without this
+# rule, five more runs of the benchmark A02 (N-four-bar mechanism) end with wrong results
 TIGHT_TOLERANCE = 1e-8
 MAX_FAILURES = 12.0  # another method takes over at this value of FAILURES, to which a step without convergence adds 2
 CHECKED_GAP = 0.0908  # longest time between evaluations at and between the nodes, relative to the step size
@@ -71,12 +71,12 @@ N_EARLY, GROWTH_EARLY, GROWTH = 6, 4.0, 1.3
 GROWTH_ONE_SWEEP = 30.0  # replaces GROWTH_EARLY after a step that took only one sweep
 MIN_FACTOR = 0.4  # smallest ratio of the next step size to the size of an accepted step
 LEAST_TREND = 0.4  # lower bound of the trend, the ratio of step sizes that the error allows in successive steps
-# step size that the convergence allows if sweeps evaluate accelerations twice, relative to that if they do so once
+# step size that the convergence allows with two evaluations of accelerations in a sweep, relative to that with one
 GAIN_BY_REPEATS = 1.5
 # sweeps stop evaluating accelerations twice (REPEATS = 0) if the convergence allows steps this many times as long as
 # the error allows: the second evaluation then saves no time
 MAX_REACH = 2.5
-MAX_EXTRAPOLATION = 3.0  # the step size that the error allows counts at most as this multiple of the actual size
+MAX_EXTRAPOLATION = 3.0  # limit of the step size that the error allows, as a multiple of the actual step size
 _array_offsets = merged(array_offsets)
 
 

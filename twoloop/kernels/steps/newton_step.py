@@ -241,7 +241,7 @@ def newton_step(f, w, options, memory, t, h, tolerances, state, new_state):
     while True:
         if memory[at.HAS_JACOBIAN] == 0.0:
             # compute derivatives at the middle stage, where stiff directions differ least from those at other stages.
-            # (At a time that is not a stage, a force might act that acts at no stage.)
+            # The middle of the step is not used, because a force might act there, but at no stage
             dt = node * h
             for m in range(n):
                 q_mid[m] = q[m] + dt * (v[m] + 0.5 * dt * a[m])

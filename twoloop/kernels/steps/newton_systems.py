@@ -527,7 +527,7 @@ def matrices_size(program: np.ndarray, n_mass: int, n_jacobian: int, n_systems: 
 
 @inlined
 def _sparse_derivative_views(f, w):
-    """Return views of w.matrices: entries of M, G, K, D, a copy of w.is_independent, numbers s of sparse_ldl.py."""
+    """Return views of w.matrices: entries of M, G, K, D; a copy of w.is_independent; factors s of rows added to M."""
     n_mass, n_jacobian, n_rows = w.mass_values.size, w.jacobian_values.size, w.is_independent.size
     begin_K = n_mass + n_jacobian
     begin_D = begin_K + mass_entries_of(f.newton_program)[0].size - n_mass
