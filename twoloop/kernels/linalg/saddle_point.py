@@ -144,7 +144,7 @@ def solve_by_reduced_mass(f, w, r, c, a):
 
 @merged
 def multipliers_by_elimination(f, w, r, a, lam):
-    """Store in lam the multipliers of independent rows, by the rows of G^T lam = r - M a for dependent coordinates."""
+    """Store the multipliers in lam, by the equations of G^T lam = r - M a that belong to dependent coordinates."""
     rows, columns, z = rows_of(w.index_v), columns_of(w.index_v), w.z
     for k in range(columns.size):
         column = columns[k]

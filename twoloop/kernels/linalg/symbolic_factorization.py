@@ -53,7 +53,7 @@ class _DisjointSets:
 
 
 class _PartSupports:
-    """Record the supports of each part (see the module's docstring) during the elimination of joints and hubs."""
+    """Record the supports (ground and hubs, see the module's docstring) of each part during the elimination."""
 
     def __init__(self, joints: Sequence[frozenset[int]], n_bodies: int, hubs: set[int], lone_bodies: AbstractSet[int]):
         self.joints, self.hubs = joints, set(hubs)  # bodies of each joint; hubs that are not eliminated yet

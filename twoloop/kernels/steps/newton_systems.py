@@ -726,7 +726,7 @@ def _filter_error_sparse(f, w, options, s, h, e_q, e_v):
 
 @compiled
 def fill_derivatives(f, w, options, memory, s, t, q, v, a):
-    """Store J_q and J_v (dense storage) or K and D (else) at the last evaluated state; return a code."""
+    """Store derivatives of accelerations (dense storage) or of forces at the last evaluated state; return a code."""
     if f.form == FIXED_ORDER:
         return _fill_sparse_tangents(f, w, memory, t, q, v)
     if f.bandwidth >= 0:
