@@ -5,8 +5,8 @@ The matrix of
     [M  G^T] [a  ]   [Q    ]
     [G  0  ] [lam] = [Gamma]
 
-with G = [C_q; A] is eliminated without its structural zeros, in an order that is chosen once. Each row of G is
-eliminated after its coordinates. So the pivots are pivots of the definite matrices M and -G M^-1 G^T: none is zero.
+with G = [C_q; A] (A: non-holonomic rows) is eliminated without structural zeros, in an order that is chosen once. Each
+row of G follows its coordinates. So the pivots are pivots of the definite matrices M and -G M^-1 G^T: none is zero.
 
 - If a row of G has a much smaller pivot than it would have without the other rows, it nearly depends on these rows, and
   the generated code reports that its results are invalid.
@@ -292,8 +292,8 @@ MAX_COST_RATIO = 0.75
 class Elimination:
     """Symbolic elimination of the equations of a system, with the rows G = [C_q; A] of all constraints.
 
-    choice : the decisions that depend on numbers.
-    equations : traced equations of the system; their graph is extended.
+    choice : rows and pivots, chosen by the numbers at one position.
+    equations : traced equations of the system, to whose graph the elimination adds its operations.
 
     Fields:
     graph : graph of the operations; its first inputs are t, q and v.
