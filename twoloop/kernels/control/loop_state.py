@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 (
     ALL_OUTPUT_DONE,  # the last output time is reached
     PAUSED,  # an array of results is full, or the call has attempted MAX_ATTEMPTS steps: call `advance` again
-    STEP_TOO_SMALL,  # the next step would not be longer than control[SHORTEST]
+    STEP_TOO_SMALL,  # the size of the next step would be at most the limit, control[SHORTEST]
     FIXED_STEP_FAILED,  # a step of fixed size failed
     RANK_LOST,  # C_q has lost rank: no partition can be chosen
     MAX_STEPS_REACHED,
@@ -23,12 +23,12 @@ from numpy.typing import NDArray
     NEEDS_DENSE,  # the fixed-order form cannot decide which rows are independent: the caller uses a dense form
     NEEDS_COMPILATION,  # the step has no machine code yet: the caller compiles it, then calls `advance` again
 ) = range(12)
-SUSPENDED = 0.5  # value of control[MAY_CROSS] after all attempts to cross a singular position have failed
+SUSPENDED = 0.5  # value of control[MAY_CROSS] after a singular position could not be crossed: ordinary steps go on
 CONTINUE = -1  # value that functions return in place of an end code if the loop goes on
 
 # indices of the parameters of step-size control. The next step size is SAFETY * error**-EXPONENT times the size of this
 # step (`error`: of this step, in tolerances), but at least FACTOR_MIN and at most FACTOR_MAX times this size. If
-# LEAST_ERROR > 0, the error of the previous step also counts (Hairer & Wanner II, IV.8), at least as LEAST_ERROR
+# LEAST_ERROR > 0, the error of the previous step, at least LEAST_ERROR, also counts (Hairer & Wanner II, IV.8)
 SAFETY, EXPONENT, FACTOR_MIN, FACTOR_MAX, LEAST_ERROR, N_RULE = range(6)
 # indices of the history of step-size control: size (s) and error (in tolerances) of the last accepted step
 H_BEFORE, ERROR_BEFORE, N_PAST = range(3)
@@ -42,25 +42,25 @@ H_BEFORE, ERROR_BEFORE, N_PAST = range(3)
     LIMIT_MEMORY,  # number of accepted steps after which clock[H_LIMIT] becomes LIMIT_START again
     MAX_STEPS,  # largest number of accepted steps
     STORE_ALL,  # 1: the states after all accepted steps are stored; 0: only states at output times
-    SYMMETRIC,  # 1: a partition is chosen at the midpoint of each step; 0: one is used until `partition_is_poor` holds
+    SYMMETRIC,  # 1: each step chooses a partition at its midpoint; 0: a partition is kept until `partition_is_poor`
     MAX_ATTEMPTS,  # number of attempted steps after which `advance` returns; its caller then checks progress and time
-    # 1: near a singular position, `advance` returns NEAR_SINGULAR; 0: it never does; SUSPENDED: it does not near the
-    # present singular position, and sets the value to 1 after the motion has left this position
+    # 1: `advance` returns NEAR_SINGULAR near a singular position, so that the caller crosses it. 0: it never does so.
+    # SUSPENDED: it does not do so near the present singular position; far from it, the value becomes 1 again
     MAY_CROSS,
     SHORTEST,  # steps must be longer than this (s), and than EQUAL_SPACINGS spacings of floating-point numbers at t
     MAY_SWITCH,  # 1: `advance` returns SWITCH_METHOD if a value is not finite, or if a step returns UNSUITED
-    # number of steps by a method on trial; -1: no trial. If the size of the next step is at most tolerances[GAP] in the
-    # trial, `advance` returns SWITCH_METHOD, because the method pays only with longer steps
+    # a method on trial is judged in this number of steps (-1: no trial): if the size of a next step is at most
+    # tolerances[GAP], `advance` returns SWITCH_METHOD
     TRIAL_STEPS,
     MAY_JUMP,  # 1: C_t, or b in A v + b = 0, may jump; 0: they are continuous in time
     JUMP_RATIO,  # largest ratio of a step's true error to its error estimate if a force jumps within the step
     SPACING,  # time (s) between samples of the forces ahead of a step, see discontinuities.py; 0: no samples
     TIME_SPACING,  # longest time (s) between samples of the forces at a fixed state, see discontinuities.py
-    # 1: forces may be sampled along the predicted motion; 0: not, because a callback has failed there
+    # 1: forces may be sampled along the predicted motion; 0: never, because a callback raised an exception there
     SAMPLE_MOTION,
     BY_TIME,  # 1: a force, C_t or b may change suddenly with time
     BY_STATE,  # 1: a force may change suddenly with q or v; steps longer than SPACING then sample it along the motion
-    FIRST_GIVEN,  # 1: the user has chosen the first step size; 0: it is a guess, and may grow before it is accepted
+    FIRST_GIVEN,  # 1: the user has chosen the first step size; 0: it is a guess, and may grow before a step is accepted
     MAX_EVALUATION_GAP,  # longest time in a step between two evaluations of the equations, relative to the step size
     TAKES_MANY,  # 1: the method has a function `attempt_many`, which takes several steps without checks between them
     CHECKS_WITHIN,  # 1: once a run has come near a singular position, pivots of C_q are checked within each step
@@ -82,16 +82,15 @@ H, ERRORS, FAILURES, PARTITIONS, JACOBIANS, N_STEP_COLUMNS = range(6)
     T_START,  # start time of the run (s); steps of fixed size h end on the grid T_START + k h
     N_FIXED,  # index k of the last grid time T_START + k h that steps of fixed size have reached
     FAILURE_CODE,  # code of the last failed step, for messages about short steps; DONE: no step failed recently
-    H_FAILED,  # size (s) of the last failed step, or of the step that caused ROWS_VIOLATED or SWITCH_METHOD
-    H_LONG,  # longest recent step (s): each accepted step multiplies it by H_LONG_DECAY, or raises it to its own size
+    H_FAILED,  # size (s) of the step that failed last, or that caused the code ROWS_VIOLATED or SWITCH_METHOD
+    H_LONG,  # longest recent step (s): after a step, the larger of its size and H_LONG_DECAY times the old H_LONG
     LARGEST_PIVOT,  # largest value so far of w.pivot, the smallest pivot in the elimination of C_q
     JUMP_FROM,  # C_t or b jumps between this time (s) and JUMP_TO; infinite: no later jump is known
     JUMP_TO,  # end (s) of the short interval with the next known jump of C_t or b
-    APPLIES_JUMP,  # 1: the next step leads from JUMP_FROM to JUMP_TO; `new_state` already contains the state at its end
+    APPLIES_JUMP,  # 1: the next step leads from JUMP_FROM to JUMP_TO; `new_state` already contains the state at JUMP_TO
     JUMP_END,  # end (s) of the last step rejected with a very large error: a force may jump before this time
     PIVOT_HERE,  # fixed-order form: smallest pivot, w.pivot, at the end of the last step
-    # forces, C_t and b are sampled ahead of a step, at the fixed state where the step begins, or at the states of the
-    # predicted motion (see discontinuities.py)
+    # samples of forces, C_t and b ahead of a step: at the fixed state where it begins, or along the predicted motion
     SAMPLED_TO,  # time (s) of the last sample at a fixed state
     SAMPLED_EVERY,  # time (s) from one sample at a fixed state to the next, in the last set of samples
     WIDEST_SAMPLING,  # longest time (s) so far from one sample to the next
@@ -102,9 +101,9 @@ H, ERRORS, FAILURES, PARTITIONS, JACOBIANS, N_STEP_COLUMNS = range(6)
     SHORTEST_CHANGE,  # shortest time (s) from a sudden change to the next one so far; infinite: fewer than two changes
     MOTION_SAMPLED_TO,  # time (s) of the last sample along the motion
     SAMPLES_MOTION,  # 1 while callbacks are called at predicted states: exceptions there do not end the run; 0: else
-    # smallest ratio of pivots of [C_q; A] at output times and at grid times so far, see `record_pivot_at_output`
+    # smallest ratio of pivots at output times and at ends of steps of fixed size, see `record_pivot_at_output`
     PIVOT_AT_OUTPUT,
-    # smallest pivot of C_q within steps while MAY_CROSS was SUSPENDED, divided by LARGEST_PIVOT; 0: no such step
+    # smallest pivot of C_q within steps taken while MAY_CROSS was SUSPENDED, divided by LARGEST_PIVOT; 0: no such step
     PIVOT_PASSED,
     N_CLOCK,
 ) = range(N_PAST, N_PAST + 29)

@@ -1,7 +1,4 @@
-"""Check, between the steps of a run, whether the partition is still good and whether a singular position is near.
-
-Pivots are those of an elimination of C_q with full pivoting (w.pivot: the smallest one). `f`: kit, `w`: workspace.
-"""
+"""Check, between steps, whether the partition is poor and whether a singular position is near, by pivots of C_q."""
 
 from twoloop.kernels.control import loop_state as at
 from twoloop.kernels.data.common import compiled, merged
@@ -17,35 +14,36 @@ COLLAPSED_STEP = 0.2
 SINGULAR_PIVOT = 0.2
 # value used instead of SINGULAR_PIVOT in the fixed-order form, whose pivots are sines of angles between rows of C_q
 FIXED_ORDER_SINGULAR = 0.01
-# below this fraction of the maximum pivot, the fixed-order form projects the stages of rejected steps that it repeats
+# fixed-order form: if the smallest pivot is below this fraction of its maximum in the run, a rejected step is repeated
+# with its stages projected onto the constraints
 REPEAT_PIVOT = 0.05
 SHRINKAGE = 0.8  # size of a step that is repeated with projected stages, relative to the size of the rejected step
 MIN_STEP_NEAR_SINGULAR = 0.001  # shortest useful step near a singular position, relative to the longest recent step
-# if the smallest pivot is below this fraction of its maximum in the run, rounding errors spoil accelerations: the run
-# ends with RANK_LOST, unless a crossing of the singular position can still be attempted
+# if no crossing can be attempted, the run ends when the smallest pivot is below this fraction of its maximum in the run
 UNDETERMINED_PIVOT = 1e-6
-CHECK_INTERVAL = 16  # number of accepted steps from one check of the partition to the next if steps do not use it
+CHECK_INTERVAL = 16  # number of steps between two checks of the partition with generated code, which does not use it
 # in the augmented form, with n degrees of freedom, the partition is checked every 1 + n // FREEDOMS_PER_CHECK steps,
 # because each check computes the null space of [C_q; A], a dense matrix that steps in this form do not need
 FREEDOMS_PER_CHECK = 32
-N_CHECKED_PARTS = 8  # `comes_near_singular` divides a step into this number of equal parts, and checks pivots between
+N_CHECKED_PARTS = 8  # number of equal parts of a step between which `comes_near_singular` computes the smallest pivot
 # pivots within a step are computed if the smallest pivot at one of its ends is below this fraction of LARGEST_PIVOT
 MAX_UNCHECKED_PIVOT = 0.5
-# `comes_near_singular` samples the smallest pivot within a step. If a sample is below this fraction of the largest
-# change from one sample to the next, the pivot may have been zero between two samples
+# `comes_near_singular` samples the smallest pivot within a step. It may be zero between two samples if one of them is
+# below this fraction of the largest change from sample to sample
 PASSED_PIVOT_RATIO = 0.6
 # MIN_NEAR_RATIO, MAX_NEAR_RATIO: limits of the result of `near_pivot_ratio`. MAX_ROUNDING_ERROR: allowed rounding error
 # near a singular position, in tolerances. EPS: unit roundoff
 MIN_NEAR_RATIO, MAX_NEAR_RATIO, MAX_ROUNDING_ERROR, EPS = 0.02, 0.1, 0.2, 2.0**-53
-MIN_END_RATIO = 0.25  # in `ends_near_singular`, smallest ratio of pivots at the end and at the beginning of a step
+# `ends_near_singular` requires that the smallest pivot at the end is below this fraction of that at the beginning
+MIN_END_RATIO = 0.25
 
 
 @merged
 def is_near_singular(f, w, control, clock, t, q):
     """Return True if control[MAY_CROSS] is 1 and a singular position is near the accepted position q at time t.
 
-    The smallest pivot at the last choice of a partition decides. If it is small, or may be old because steps of
-    generated code do not use the partition, first choose a new partition at (t, q).
+    The smallest pivot at the last choice of a partition, w.pivot, decides. If it is small, or may be old because
+    generated code does not use the partition, choose a new partition at (t, q) first.
     """
     if control[at.MAY_CROSS] != 1.0:
         return False
@@ -94,7 +92,7 @@ def prepare_projected_repetition(f, w, control, clock, size):
 
 @merged
 def near_pivot_ratio(tolerances):
-    """Return pivot / LARGEST_PIVOT below which rounding errors may be larger than MAX_ROUNDING_ERROR tolerances."""
+    """Return the limit of pivot / LARGEST_PIVOT below which rounding may cause errors above MAX_ROUNDING_ERROR."""
     return min(max(MIN_NEAR_RATIO, (EPS / (MAX_ROUNDING_ERROR * tolerances[LEAST])) ** (1.0 / 3.0)), MAX_NEAR_RATIO)
 
 
@@ -150,7 +148,7 @@ def comes_near_singular(f, w, control, clock, tolerances, t, size, state, new_st
 
 @merged
 def record_pivot_at_output(f, w, clock, state):
-    """Lower clock[PIVOT_AT_OUTPUT] to the ratio of smallest to largest pivot of [C_q; A] at `state`, if less."""
+    """Reduce clock[PIVOT_AT_OUTPUT] to the ratio of the smallest to the largest pivot at `state` if this is smaller."""
     pivot = min_pivot_ratio(f, w, clock[at.T], state[: w.Q.size])
     if f.form == FIXED_ORDER and pivot > 0.0:
         # pivots of the fixed-order form are sines of angles between rows. All are small in large mechanisms: only the

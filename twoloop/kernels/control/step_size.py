@@ -65,7 +65,7 @@ def record_accepted_step(rule, past, h, error):
 
 @compiled
 def project_and_evaluate(f, w, t, Q, V, A):
-    """Project (Q, V), a state near the constraints, in place, and store its accelerations in A; return a code."""
+    """Project (Q, V), near the constraints, in place; store its accelerations in A; return DONE or a failure code."""
     # in generated code, the task PROJECT is the cheapest; in the fixed-order form, the task EVALUATE does not project
     if (f.is_generated == 1 and w.Rate.size == w.C.size) or f.form == FIXED_ORDER:
         return f.inner(f, w, PROJECT, t, Q, V, INNER_TOL, A, w.lam)
@@ -121,7 +121,7 @@ H_LONG_DECAY = 0.98  # each accepted step multiplies clock[H_LONG], the longest 
 
 @merged
 def count_step(w, tolerances, control, clock, size, out_step):
-    """Count an accepted step of size `size` (s): update w and clock, and fill `out_step`, a row of out_steps."""
+    """Count an accepted step of size `size` (s): update clock[H_LONG] and statistics in w, and fill `out_step`."""
     w.n_accepted += 1
     if w.defect >= 0.0:
         w.largest_defect = max(w.largest_defect, w.defect)
@@ -184,7 +184,7 @@ def prediction_error(w, tolerances, h, q, v, q1):
 
 @merged
 def project_prediction(f, w, tolerances, t, h, q, v, q1, v1, inner_tol):
-    """Move (q1, v1), predicted by a step from (q, v), onto the constraints; return a code and `prediction_error`."""
+    """Move the predicted (q1, v1) onto the constraints; return DONE or a failure code, and the `prediction_error`."""
     store_prediction(w, q1)
     code = restore_constraints(f, w, t, q1, v1, inner_tol)
     return code, prediction_error(w, tolerances, h, q, v, q1) if code == DONE else 0.0

@@ -63,11 +63,11 @@ MIN_COST_PER_COORDINATE = 64.0
 TRIAL_COST = 300.0  # approximate cost of a trial of the implicit method, in evaluations of the implicit method
 # unless h rho exceeds STABILITY_LIMIT, a trial waits until the run has cost as much as this number of trials
 MIN_COST_IN_TRIALS = 3.0
-COUNTED_FRACTION_OF_RUN = 0.3  # at least this fraction of the expected cost of the whole run counts as its cost so far
+COUNTED_FRACTION_OF_RUN = 0.3  # the cost so far counts as at least this fraction of the expected cost of the whole run
 # after the run has cost this multiple of MIN_COST_IN_TRIALS trials, a trial begins at any value of rho. After k trials,
 # the next one begins at k + 1 times this cost
 COST_OF_ANY_TRIAL = 100.0
-MIN_RATIO_TO_MOTION = 30.0  # the motion does not show rho ("hidden") if rho exceeds this multiple of `_motion_rate`
+MIN_RATIO_TO_MOTION = 30.0  # rho is "hidden" (not seen in the motion) if it exceeds this multiple of `_motion_rate`
 QUIET_FACTOR = 10.0  # vibrations count as small if their velocities are at most this number of tolerances
 # if rho is hidden, or its vibrations are small, a trial begins if h rho exceeds this multiple of options[LIMIT]
 MIN_HIDDEN_RATIO = 0.05
@@ -103,7 +103,7 @@ N_OPTIONS = N_PAIR + 2 * N_OF_EACH
     NEXT_ESTIMATE,  # number of evaluations, counted from the start of the run, after which rho is estimated again
     ESTIMATES_TO_WAIT,  # number of estimates of rho that must still follow before the next trial may begin
     WAIT,  # value of ESTIMATES_TO_WAIT at the end of the last trial
-    T_BEGIN,  # time (s) at which the measurement of the cost per second began; NaN: no step was attempted yet
+    T_BEGIN,  # time (s) at which the measurement of the cost per second began; NaN: it begins with the next step
     COST_BEGIN,  # cost of the run up to the time T_BEGIN, in evaluations
     COST_PER_SECOND,  # cost of a second of motion before the last trial, in evaluations by the explicit method
     RATE,  # last estimate of rho (1/s)
@@ -131,7 +131,7 @@ def switching_options(
     """Return the array `options` of a pair of methods, the first one explicit, the second one implicit.
 
     `limit`, `estimates`, `matrix_cost` and `ratio` are the values of LIMIT, N_ESTIMATES, MATRIX_COST and COST_RATIO.
-    `rules` has a row for each method: parameters of step-size control, then w.reuse. `first`, `second`: their options.
+    `rules` has a row for each method: parameters of step-size control and w.reuse. `first`, `second`: their options.
     """
     first = np.asarray(first)  # its entries are numbers, or expressions recorded for parameters of the system
     scalars = [limit, float(estimates), matrix_cost, ratio, float(first.size)]
@@ -167,7 +167,7 @@ def _memory_views(memory, n):
 def _power_iteration(f, w, t, state, direction, by_v, Q, V, A):
     """Take one power iteration: multiply `direction` (n_q) by dF/dq or, if `by_v` is True, by dF/dv (F: accelerations).
 
-    Only components of independent coordinates are used. Scale the product to a largest component of 1, and return the
+    Only components of independent coordinates are used. Divide the product by its largest |component|, and return this
     growth, an estimate of the largest eigenvalue. If F cannot be evaluated, return 0. (Q, V, A) is scratch.
     """
     n = Q.size
@@ -202,7 +202,7 @@ def _largest_rate(f, w, memory, t, state, new_state):
     by_q, by_v = memory[N_SCALARS : N_SCALARS + n], memory[N_SCALARS + n : N_SCALARS + 2 * n]
     Q, V, A = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n]
     growth_by_q = growth_by_v = 0.0
-    # generated code does not use the partition, which may be old. Choose a new one: its independent coordinates move
+    # generated code does not use the partition: it may be old, and its independent coordinates may hardly move
     is_explicit = memory[PHASE] == EXPLICIT
     if is_explicit and f.is_generated == 1 and renew_partition(f, w, t, state[:n]) != DONE:
         return 0.0
@@ -222,7 +222,10 @@ def _largest_rate(f, w, memory, t, state, new_state):
 
 @compiled
 def _motion_rate(f, w, t, state, rate, Q, V, A):
-    """Return max|a| / max|v| or max|da/dt| / max|a| (1/s), whichever is larger; inf: unknown. `rate` is rho (1/s)."""
+    """Return the rate (1/s) of the motion, the larger of max|a| / max|v| and max|da/dt| / max|a|; inf: unknown.
+
+    `rate`, the largest rate rho, determines the time step of the finite difference for da/dt. (Q, V, A) is scratch.
+    """
     n = Q.size
     dt = DIFFERENCE_STEP / rate
     fastest = largest = change = 0.0
@@ -269,7 +272,6 @@ def _cost_per_second(w, options, memory, t):
 
 @compiled
 def _evaluations_between_estimates(options, memory):
-    """Return the number of evaluations of the active method between two estimates of rho, see BETWEEN_ESTIMATES."""
     return BETWEEN_ESTIMATES * options[COST_RATIO] if _is_explicit(memory) else BETWEEN_ESTIMATES
 
 
@@ -338,7 +340,7 @@ def _phase_to_begin(f, w, options, memory, tolerances, t, state, new_state):
     )
     if is_cheap and h_rho <= 1.0:  # (else N_ABOVE_LIMIT keeps its value, so that a trial begins when it is cheap)
         memory[N_ABOVE_LIMIT] = 0.0
-    is_expensive = cost_per_second > MIN_GAIN * memory[COST_PER_SECOND]  # the explicit method was cheaper
+    is_expensive = cost_per_second > MIN_GAIN * memory[COST_PER_SECOND]  # the explicit method cost less
     if (memory[PHASE] == EXPLICIT and is_due) or (memory[PHASE] == IMPLICIT and (h_rho < RETURN_BELOW or is_expensive)):
         memory[COST_PER_SECOND] = cost_per_second
         memory[N_TRIALS] += 1.0
@@ -365,7 +367,7 @@ def commit_switching(f, w, options, memory, tolerances, accepted):
 
 @kernel(ATTEMPT)
 def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """Attempt a step by the active method; before this, change the method if an estimate of rho or a trial says so.
+    """Attempt a step by the active method; first change this method if an estimate of rho or a trial requires it.
 
     The memory of a method is set to zero when this method becomes active. Each method has its own step-size control.
     """

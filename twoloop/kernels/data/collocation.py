@@ -13,7 +13,7 @@ MAX_ROUNDING = 1e-13  # a difference of two values up to this fraction of the va
 # size was only a guess, and another one must be tried. NOT_COMPUTED: accelerations at the nodes could not be computed
 CONVERGED, REJECTED, GUESSED, NOT_COMPUTED = range(4)
 
-# indices of single numbers
+# indices of single numbers in the memory of collocation steps
 (
     T,  # time at the beginning of the step (s)
     H,  # step size (s)
@@ -21,20 +21,20 @@ CONVERGED, REJECTED, GUESSED, NOT_COMPUTED = range(4)
     DEGREE,  # degree of the polynomial that predicts the accelerations in this step
     PREDICTS,  # 1: a polynomial predicts the accelerations in this step; 0: they are predicted to be constant
     CURRENT,  # index, 0 or 1, of the stored polynomial that belongs to the last accepted step
-    TRIED,  # 1: the other stored polynomial belongs to the last attempted step; 0: it is not in use
+    TRIED,  # 1: the stored polynomial with the index 1 - CURRENT belongs to the attempted step; 0: it is not in use
     NEXT_DEGREE,  # degree of the polynomial that will predict the accelerations in the next step
     OLD_DEGREE,  # DEGREE before a step was rejected; the next accepted step restores it; 0: no rejected step
-    MAY_GUESS,  # 1: the step size is a guess; if RHO is too small or too large, try another size; 0: it is final
-    N_MASS_FIRST,  # in this number of next steps, elimination begins with M, because another order has failed
+    MAY_GUESS,  # 1: the step size is a guess; if the contraction RHO is not suitable, try another size; 0: it is final
+    N_MASS_FIRST,  # number of next steps in which elimination begins with the mass matrix: another order has failed
     N_GUESSES,  # number of guesses of the first step size so far
     N_STEPS,  # number of accepted steps since the method began
     LIMITED,  # counter, at least 0: +1 for a step whose size was limited by the convergence, -1 for any other step
     FAILURES,  # counter, at least 0: +2 for a step that did not converge, -1 for an accepted step
     DEFECT,  # largest defect of the accelerations between nodes, relative to the allowed defect; -1: not evaluated
-    RHO,  # contraction: ratio of the change of velocities by a sweep to the change by the sweep before
-    SWEEPS,  # number of sweeps that the step took
-    N_TARGET,  # number of sweeps that a step should take: the size of the next step is chosen accordingly
-    CHANGE,  # change of velocities by the last sweep, relative to the tolerances
+    RHO,  # contraction: ratio of the changes of velocities by the last sweep (iteration) and by the one before
+    SWEEPS,  # number of sweeps (iterations for all stages) that the step took
+    N_TARGET,  # number of sweeps (iterations) that a step should take: the next step size is chosen accordingly
+    CHANGE,  # change of velocities by the last sweep (iteration), relative to the tolerances
     ERROR,  # error of the step, relative to the tolerances
     CURVATURE,  # largest Legendre coefficient (degree 5 or 6) of the accelerations in a step, relative to tolerances
     FACTOR,  # largest ratio of the next step size to this one that the convergence allows
@@ -42,16 +42,16 @@ CONVERGED, REJECTED, GUESSED, NOT_COMPUTED = range(4)
     FACTOR_OF_DEFECT,  # largest ratio of the next step size to this one that the defect allows
     ALLOWED_H,  # largest size (s) with which the last step would have satisfied the error test
     SIZE,  # largest |v| + H |a| at the beginning of the step, relative to the tolerances: the scale of rounding errors
-    STRICTER,  # largest of all WEIGHTS, divided by the largest one of an iterated coordinate
-    REPEATS,  # 1: each sweep evaluates accelerations at old velocities, then again at new ones; 0: once
+    STRICTER,  # largest weight of all coordinates (see WEIGHTS), divided by the largest one of an iterated coordinate
+    REPEATS,  # 1: each sweep (iteration) evaluates accelerations at old, then again at new velocities; 0: only once
 ) = range(29)
-# offsets of arrays that follow the single numbers; each has eight numbers, except WEIGHTS (n_q)
-POWERS = 32  # powers 1 to 8 of H / H_BEFORE
-SCALED = 40  # coefficients of the polynomial that predicts one acceleration, multiplied by POWERS
-MOVED = 48  # for each of eight steps whose ends are projected: largest change of a coordinate by the last iteration
-VALID = 56  # for each of these eight steps: 1 if the projection of its end is valid so far, else 0
-DEFECTS = 64  # values of DEFECT of up to eight successive steps
-WEIGHTS = 72  # for each coordinate: 1 / (allowed error of its velocity, in the unit of the velocity)
+# offsets of arrays that follow the single numbers
+POWERS = 32  # offset of eight numbers: powers 1 to 8 of H / H_BEFORE
+SCALED = 40  # offset of eight numbers: coefficients of the polynomial that predicts an acceleration, times POWERS
+MOVED = 48  # offset of eight numbers, one for each projected end of a step: largest change of a coordinate by a pass
+VALID = 56  # offset of eight numbers, one for each projected end of a step: 1 if its projection is valid, else 0
+DEFECTS = 64  # offset of eight numbers: values of DEFECT in successive steps
+WEIGHTS = 72  # offset of n_q numbers: weights, 1 / (allowed error of the velocity) for each coordinate
 
 
 def array_offsets(n, n_iterated, n_rows):

@@ -28,7 +28,7 @@ from twoloop.kernels.data.indices import ATOL, COUNTERS, ESTIMATE, FLAGS, GAP, G
 
 i8 = types.int64
 INTEGERS = types.int64[::1]
-INTEGERS_32 = types.int32[::1]  # for long programs (lists of operations): as 32-bit integers, more fits in the cache
+INTEGERS_32 = types.int32[::1]  # for programs (lists of operations) so long that 64-bit integers overfill the cache
 
 # names of the programs (lists of operations) in `Functions`. jacobian_... and gamma_... replace missing callbacks, see
 # evaluation/operations.py. ldl_program and newton_program factor the matrices of large systems, see
@@ -48,24 +48,26 @@ class Work(NamedTuple):
     """
 
     M: Any  # (n_q, n_q) mass matrix
-    L: Any  # (n_q, n_q) inverse of M if M is constant, else the factors of M, dense (see ldl_factor) or banded
-    G: Any  # (n_c + n_a + 1, n_q) [C_q; A] at the position that was evaluated last, and a row of zeros
-    entries: Any  # view of G as a vector, row by row
-    augmented: Any  # view, as a vector, of the entries of G followed by those of M
-    S: Any  # (r_v, r_v) Schur complement G M^-1 G^T of the independent rows of G, then its factors
-    W: Any  # (r_v, n_q) G M^-1 of the independent rows of G
-    A: Any  # (n_dof, n_dof) T^T M T (columns of T: null space of G), then its factors; empty where S is used
-    MT: Any  # (n_q, n_dof) M T
-    D: Any  # (n_dof + 1, r_v) -(G_d^-1 G_i)^T, the null space; last row: v_d for v_i = 0; columns in elimination order
-    Gx: Any  # (n_c + n_a, n_q) [C_q; A] at a displaced position, for Gamma by differences; scratch for full pivoting
-    G_of_S: Any  # (n_c + n_a, n_q) G for which S and W were computed, if M is constant; NaN: S and W are not valid
-    pattern: Any  # (n_c + n_a, n_q) 1 for entries of G that have been nonzero at any position of the run, else 0
-    mass_pattern: Any  # (n_q, n_q) the same for entries of M; used in the augmented form only, else empty
-    row_entries: Any  # for each row of G: index in this array of its list; then the lists: columns of nonzero entries
+    L: Any  # (n_q, n_q) inverse of the mass matrix if it is constant, else its factors: dense (ldl_factor) or banded
+    G: Any  # (n_c + n_a + 1, n_q) constraint Jacobian [C_q; A] at the position evaluated last, then a row of zeros
+    entries: Any  # view of the constraint Jacobian G as a vector, row by row
+    augmented: Any  # view, as one vector, of the constraint Jacobian G followed by the mass matrix M
+    S: Any  # (r_v, r_v) Schur complement G M^-1 G^T (G: independent rows of the constraint Jacobian), then its factors
+    W: Any  # (r_v, n_q) G M^-1 (G: independent rows of the constraint Jacobian; M: mass matrix)
+    A: Any  # (n_dof, n_dof) reduced mass matrix T^T M T (T: null space of G), then its factors; empty where S is used
+    MT: Any  # (n_q, n_dof) mass matrix times T, whose columns are the null space of the constraint Jacobian
+    # null space of G: a row of -(G_d^-1 G_i)^T contains the dependent velocities, in the order of elimination, if one
+    # independent velocity is 1 and no drive moves; the last row of D, if all are 0 and drives move
+    D: Any  # (n_dof + 1, r_v)
+    Gx: Any  # (n_c + n_a, n_q) constraint Jacobian at a displaced position; scratch for full pivoting
+    G_of_S: Any  # (n_c + n_a, n_q) value of G for which S and W were computed, if M is constant; NaN: they are invalid
+    pattern: Any  # (n_c + n_a, n_q) 1 for entries of the constraint Jacobian that have been nonzero in the run, else 0
+    mass_pattern: Any  # (n_q, n_q) 1 for entries of M that have been nonzero, else 0; only in the form AUGMENTED
+    row_entries: Any  # for each row of G, the index of its list in this array; then the lists: columns of its entries
     Gamma_tried: Any  # (2, n_c + n_a) Gamma by differences with twice the time step e, and with the previous value of e
-    rates: Any  # (13, n_c + n_a) C_t and b at times within a step, see discontinuities.py
-    changes: Any  # (N_CHANGES, n_q + n_c + n_a) samples of forces, C_t and b at later times, see discontinuities.py
-    Q: Any  # (n_q) force
+    rates: Any  # (13, n_c + n_a) constraint rates C_t and b at 13 times within a step, see discontinuities.py
+    changes: Any  # (N_CHANGES, n_q + n_c + n_a) samples of forces, C_t and b ahead of a step, see discontinuities.py
+    Q: Any  # (n_q) generalized forces
     x: Any  # (n_q) scratch, for example a displaced position
     y: Any  # (n_q) scratch, for example a correction of positions
     C: Any  # (n_c) violations C(t, q) of the constraints; also scratch
@@ -73,18 +75,18 @@ class Work(NamedTuple):
     Gamma: Any  # (n_c + n_a) right-hand side of G a = Gamma for the accelerations a
     g: Any  # (n_c + n_a) scratch, with one entry for each row of G
     z: Any  # (r_v) scratch, with one entry for each independent row of G
-    lam: Any  # (n_c + n_a) scratch for multipliers that the caller does not need
+    lam: Any  # (n_c + n_a) multipliers that are computed, but not needed by the caller
     minimum: Any  # scratch for the multipliers of least norm, see saddle_point.py
     rows: Any  # (r) indices of the independent rows of C_q
     dependent: Any  # (r) indices of the dependent coordinates
     independent: Any  # (n_q - r) indices of the independent coordinates
-    index: Any  # list of operations that factors C_qd, see markowitz_lu.py
-    values: Any  # factors of C_qd, the dependent columns of the independent rows of C_q
+    index: Any  # list of operations that factors C_qd, the dependent columns of C_q, see markowitz_lu.py
+    values: Any  # factors of C_qd, the dependent columns of C_q (independent rows only)
     rows_v: Any  # (r_v) indices of the independent rows of G
     dependent_v: Any  # (r_v) indices of the dependent velocities
     independent_v: Any  # (n_dof) indices of the independent velocities
-    index_v: Any  # list of operations that factors G_d, the dependent columns of the independent rows of G
-    values_v: Any  # factors of G_d
+    index_v: Any  # list of operations that factors G_d, the dependent columns of G (independent rows only)
+    values_v: Any  # factors of G_d, the dependent columns of the constraint Jacobian G
     index_a: Any  # list of operations that factors the augmented matrix [M G^T; G 0]; index_a[SIZE] = 0: none yet
     values_a: Any  # factors of the augmented matrix; empty in other forms than AUGMENTED
     right: Any  # (2 (n_q + r_v)) right-hand side of equations with the augmented matrix, then scratch
@@ -95,7 +97,7 @@ class Work(NamedTuple):
     predicted: Any  # (r) dependent positions predicted by the integration formula, before they are projected
     notes: Any  # (N_NOTES) values that one kernel stores for another, see indices.py
     nodes: Any  # results of all operations of a traced program, see evaluation/operations.py
-    matrices: Any  # matrices of Newton's method, see steps/stages.py and steps/newton_systems.py
+    matrices: Any  # matrices of Newton's method in implicit steps, see steps/stages.py and steps/newton_systems.py
     # the next fields, up to `solutions`, belong to the fixed-order form and are empty in other forms; N = n_q + n_c
     mass_values: Any  # nonzero entries of M, in the order of linalg/symbolic_factorization.py
     jacobian_values: Any  # nonzero entries of C_q, in the order of linalg/symbolic_factorization.py
@@ -146,9 +148,8 @@ class Attempt(NamedTuple):
 
 
 class Step(NamedTuple):
-    """Compiled functions of a method.
+    """Compiled functions of a method: `attempt` computes a step; `commit` saves or discards its data in `memory`.
 
-    `attempt` computes a step. `commit` then updates the method's memory, according to whether the step is accepted.
     `many` computes several accepted steps in one call; None: the method has no such function.
     """
 
@@ -189,7 +190,7 @@ KIT.add_function("attempt_many", MANY)
 OWN_FUNCTIONS = {
     # functions of a state: arguments (t, q, v, f.numbers), then arrays of results. own_accelerate stores accelerations;
     # own_correct_positions, the correction of q and the corrected q; own_project, accelerations, the correction of q,
-    # the corrected q and v, and multipliers. own_redundant stores nothing: it returns True if redundant rows hold
+    # corrected q and v, and multipliers. own_redundant stores nothing: it returns True if redundant rows are satisfied
     "own_accelerate": types.boolean(f8, VECTOR, VECTOR, VECTOR, VECTOR),
     "own_correct_positions": types.boolean(f8, VECTOR, VECTOR, VECTOR, VECTOR, VECTOR),
     "own_project": types.boolean(f8, *[VECTOR] * 8),
@@ -254,7 +255,6 @@ def source_digest(module: str) -> str:
 
 
 def _module_name(function: Callable[..., Any]) -> str:
-    """Return the name, such as "steps.stages", of the module that defines a kernel."""
     path = Path(inspect.getfile(function)).with_suffix("")
     return ".".join(path.relative_to(_FOLDER).parts) if path.is_relative_to(_FOLDER) else path.stem
 
@@ -298,7 +298,7 @@ def _helper_decorator(**options: Any) -> Callable[[Callable[..., Any]], Dispatch
 # numba passes the flags of a caller on to the functions that it calls. So forceinline is always set: else all helpers
 # that a merged helper calls would be merged, too
 exact = _helper_decorator(fastmath=False, forceinline=False)  # keeps the order of floating-point operations
-compiled = _helper_decorator(forceinline=False)  # LLVM compiles a function, and inlines it only if it is short
+compiled = _helper_decorator(forceinline=False)  # compiled as a function, which LLVM inlines only if it is short
 inlined = _helper_decorator(inline="always")  # inlined by numba; only a helper of this kind can return views of arrays
 # LLVM replaces each call by a copy of the code. For short helpers, and for helpers used in every evaluation
 merged = _helper_decorator(forceinline=True)
@@ -351,7 +351,7 @@ def _type_of_kit(value: Any, context: Any) -> Any:
     return KIT
 
 
-# indices of callbacks in the tuple Functions. w.fault_kind has these values
+# indices of callbacks in Functions: values of w.fault_kind, the callback that returned NaN or infinity
 MASS, FORCE, CONSTRAINT, JACOBIAN, RATE, GAMMA = (
     Functions._fields.index(kind) for kind in ("mass", "force", "constraint", "jacobian", "constraint_rate", "gamma")
 )
@@ -403,7 +403,7 @@ def faulty_callback(w):
     return FORCE if not finite_vector(w.Q) else -1
 
 
-GAP_SLACK = 1e-9  # an excess of a step size over tolerances[GAP] by this fraction counts as a rounding error
+GAP_SLACK = 1e-9  # a step may be longer than tolerances[GAP] by this fraction, which counts as a rounding error
 
 
 @merged

@@ -24,18 +24,17 @@ from twoloop.kernels.compile.callbacks import OPTIONAL_KINDS
     STOPPED,  # an evaluation was left out because the time limit of the run has passed, see TIME_IS_UP
 ) = range(13)
 
-# indices in Functions.flags, integers that describe a system to kernels; 0 is the opposite of 1
+# indices in Functions.flags, integers that describe a system to kernels
 (
-    CONSTANT_MASS,  # 1: M is constant
-    DIAGONAL_MASS,  # 1: M is diagonal
-    BANDWIDTH,  # bandwidth of M if linear algebra with M is banded; -1: it is not
+    CONSTANT_MASS,  # 1: the mass matrix M is constant; 0: it varies
+    DIAGONAL_MASS,  # 1: the mass matrix M is diagonal; 0: it may have other entries
+    BANDWIDTH,  # bandwidth of the mass matrix if it is factored as a banded matrix; -1: it is not
     FORM,  # form of the linear equations for accelerations: MULTIPLIERS, NULL_SPACE, AUGMENTED or FIXED_ORDER
     DENSE_FORM,  # value of FORM that replaces AUGMENTED if the sparse factors have too many entries
-    IS_GENERATED,  # 1: the inner loop is code generated for the mechanism
+    IS_GENERATED,  # 1: the inner loop is code generated for the mechanism; 0: it is the general one
     FIRST_GIVEN,  # index of the first flag of an optional callback, see GIVEN
 ) = range(7)
-# values of FORM, see linalg/saddle_point.py and, for FIXED_ORDER, evaluation/sparse_inner_loop.py
-MULTIPLIERS, NULL_SPACE, AUGMENTED, FIXED_ORDER = range(4)
+MULTIPLIERS, NULL_SPACE, AUGMENTED, FIXED_ORDER = range(4)  # values of FORM: saddle_point.py, sparse_inner_loop.py
 # index in Functions.flags for the name of each optional callback; the flag is 1 if the user has given the callback
 GIVEN = {name: index for index, name in enumerate(OPTIONAL_KINDS, FIRST_GIVEN)}
 N_FLAGS = FIRST_GIVEN + len(GIVEN)
@@ -59,24 +58,23 @@ FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN, REACTION_BY_Q_GIVEN, MASS_VALUES_GIVEN = (
 
 # indices in Work.notes: values that one kernel stores for another
 (
-    SENSITIVITY,  # max|C_qd^-1 C_qi| at the first check of this partition, at least 1; 0: not checked yet
+    SENSITIVITY,  # largest derivative of a dependent by an independent coordinate when first checked, or 1; 0: not yet
     ORIENTATION,  # sign of det C_qd (dependent columns) at the last accepted state with this partition; 0: not known
-    ORIENTATION_NEW,  # sign of det C_qd at the end of the attempted step; 0: not known
+    ORIENTATION_NEW,  # sign of det C_qd (dependent columns of C_q) at the end of the attempted step; 0: not known
     FAULT_KIND,  # index in Functions of a callback that returned NaN or infinity; -1: none known
     FAULT_TIME,  # time (s) at which this callback returned NaN or infinity
     GAMMA_REQUIRED,  # allowed error of Gamma by differences (evaluation/constraints.py), relative to GAMMA_SCALE
     GAMMA_STEP_RATIO,  # time step of the differences for Gamma, relative to the result of `largest_difference_step`
     GAMMA_ACCURACY,  # error of Gamma, relative to GAMMA_SCALE, when GAMMA_STEP_RATIO was chosen last
-    GAMMA_SCALE,  # size of Gamma, to which its errors are compared: largest |entry| or sum of |terms| of G a so far
-    REUSE,  # after a correction of positions of at most this size, C_qd is not evaluated and factored again
+    GAMMA_SCALE,  # size of Gamma, to which its errors are compared: largest |entry|, or sum of |terms| of G a, so far
+    REUSE,  # after a correction of positions of at most this size, the Jacobian is not evaluated and factored again
     ROUNDED,  # rounding error of positions; used instead of REUSE for states at the ends of steps
     GENERATION,  # number of partitions so far: a change of this number shows that the partition has changed
     RANK,  # rank of C_q, stored only if the workspace was allocated for another rank (code RANK_DIFFERS)
     RANK_V,  # rank of [C_q; A], stored together with RANK
     CONTRADICTION,  # with the code ROWS_CONTRADICT: index of a violated row of [C_q; A]
     PIVOT,  # smallest pivot of C_q, rows scaled to 1, at the last full pivoting; small near a singular position
-    # 1: the run has come near a singular position, or cannot check for them; 2 (fixed-order form): it is near one, and
-    # stages must be projected; 0: else
+    # 1: the run has come near a singular position, or does not check; 2: near one, stages are projected; 0: else
     NEARLY_SINGULAR,
     NEAR_NOW,  # 1: a singular position was near at the last check; 2: the next check chooses a new partition; 0: else
     MASS_SCALE,  # factor by which M is multiplied in the augmented matrix, see linalg/saddle_point.py
@@ -90,9 +88,9 @@ FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN, REACTION_BY_Q_GIVEN, MASS_VALUES_GIVEN = (
     WIDEST_GAP,  # longest time (s) between two evaluations of the equations within accepted steps
     LAST_JUMP,  # time (s) of the last known jump of C_t or b; -infinite: none
     NEXT_JUMP,  # time (s) of the next known jump of C_t or b, or the end of the run; infinite: neither is known
-    # a redundant row of G is a combination of independent rows: largest |coefficient| at the last partition; 0: unknown
+    # redundant rows are combinations of independent rows: largest |coefficient| at the last partition; 0: unknown
     MAX_COEFFICIENT,
-    SMALLEST,  # fixed-order form: smallest sine^2 of the angle of a row of C_q to others; negative: M is not definite
+    SMALLEST,  # fixed-order form: smallest sine^2 of an angle between rows of C_q; negative: M is not positive definite
     TIME_IS_UP,  # 1: the time limit of the run has passed (set by another thread), and evaluations return STOPPED
     N_NOTES,
 ) = range(33)
@@ -114,20 +112,20 @@ FLAGS = _group("CONSTANT_MASS", "FIRST_GIVEN") | {f"{kind}_given": index for kin
     ESTIMATE,  # 1: steps estimate their errors; 0: they do not, because the step size is fixed
     LEAST,  # smallest tolerance of a coordinate or a velocity at the start of the run
     GAP,  # longest allowed time (s) between two evaluations of the equations
-    DEFECT_GAP,  # replaces GAP (s) in steps that evaluate their defect between nodes; at most GAP
+    DEFECT_GAP,  # longest allowed time (s) between two evaluations in steps that evaluate their defect between nodes
     ATOL,  # index of the first absolute tolerance; there is one for each coordinate and its velocity
 ) = range(6)
-MAX_GAP_RATIO = 0.01  # value of GAP, relative to the duration of the run
+MAX_GAP_RATIO = 0.01  # longest time between two evaluations, tolerances[GAP], relative to the duration of the run
 REPORTED_ERROR = 30.0  # near a singular position, velocity errors above this number of tolerances are reported
 
 WINDOW = 4  # number of states that a polynomial of dense output interpolates
 # kinds of intervals between accepted states. The kind tells which data the polynomials of dense output interpolate
 (
-    SEPARATE,  # one polynomial for q interpolates q and v; another for v interpolates v and a, whose errors differ
+    SEPARATE,  # one polynomial interpolates q and v, and yields q; another interpolates v and a, and yields v
     VELOCITIES,  # one polynomial interpolates q and v, but not the accelerations a, which contain noise of stiff modes
     ACCELERATIONS,  # one polynomial interpolates q, v and a
     ACROSS,  # same as ACCELERATIONS, for a step across a singular position
-    JUMP,  # velocities jump, and nothing is interpolated: only a few floating-point numbers are in the interval
+    JUMP,  # no polynomial: velocities jump in the interval, which is only a few floating-point numbers long
 ) = range(5)
 # columns of the table of intervals, which has one row for each interval that contains output times
 (

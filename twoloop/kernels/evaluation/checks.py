@@ -1,11 +1,12 @@
-"""Check the start of a run in compiled code: evaluate all callbacks, check C_q and A, and choose units of coordinates.
+"""Check the start of a run in compiled code: evaluate all callbacks, check their values, choose units of coordinates.
 
-If the evaluation finds nothing wrong, no other check needs to run. Units of rows and of coordinates are chosen so that
-the entries of C_q in these units have similar sizes. The linear range of a row of C_q is the distance over which the
+If `evaluate_start` finds nothing wrong, the slower checks in Python (twoloop/checks) are left out. C_q is the Jacobian
+of constraints on positions; A contains the rows of non-holonomic constraints A v + b = 0. Units of coordinates and rows
+are chosen so that the entries of C_q in these units have similar sizes. The linear range of a row of C_q is how far
 coordinates can move before the row changes much (checks/scales.py). `f` is the kit, with the callbacks.
 
-Callbacks are also compared with their traces, see generate/traced_values.py. For each traced number, a bound of its
-rounding error is computed, in units of EPS; it is at least the sum of the absolute values of the number's terms.
+`compare_traces` compares callbacks with their traces, see generate/traced_values.py. For each traced number, it
+computes a bound of the rounding error in units of EPS, at least the sum of the |terms| of the number.
 """
 
 import math
@@ -17,9 +18,9 @@ from twoloop.kernels.evaluation import operations as op
 from twoloop.kernels.evaluation.operations import result_of_operation
 from twoloop.kernels.linalg.dense import largest_of, ldl_factor
 
-NO_ENTRY = 1e-12  # entries of C_q up to this size, relative to the largest entry of the row, count as rounding errors
-MAX_SWEEPS = 20  # largest number of sweeps of the alternating least squares in column_units
-NEGLIGIBLE = 1e-6  # linear_ranges leaves out coordinates up to this size, relative to the largest one of their row
+NO_ENTRY = 1e-12  # an entry of C_q counts as zero if it is at most this fraction of the largest entry of its row
+MAX_SWEEPS = 20  # largest number of iterations in `column_units`; each fits all rows, then all columns
+NEGLIGIBLE = 1e-6  # `linear_ranges` leaves out a coordinate of a row if it is at most this fraction of the largest one
 
 
 @exact
@@ -34,9 +35,9 @@ def _sort(values):
 
 @exact
 def _fit_column_units(rows, columns, mask, logs):
-    """Store in `columns` the logarithms of the units of coordinates that best fit the units of the rows, `rows`.
+    """Fit the units of coordinates, `columns`, to given units of rows, `rows`; return True if no unit changed.
 
-    `rows`, `logs`: logarithms of units, and of |entries|; `mask`: 1 for each entry. Return whether no unit changed.
+    These units, and the |entries| `logs` of C_q, are logarithms. `mask`: 0 for entries that count as zero, else 1.
     """
     is_unchanged = True
     for j in range(columns.size):
@@ -53,7 +54,7 @@ def _fit_column_units(rows, columns, mask, logs):
 
 @exact
 def _fit_row_units(columns, rows, mask, logs):
-    """Store in `rows` the logarithms of the units of rows that best fit the units of coordinates, `columns`."""
+    """Fit the units of rows to given units of coordinates; arguments as in `_fit_column_units`."""
     for i in range(rows.size):
         total, n = 0.0, 0
         for j in range(columns.size):
@@ -65,11 +66,11 @@ def _fit_row_units(columns, rows, mask, logs):
 
 @kernel(types.void(MATRIX, VECTOR, VECTOR, MATRIX, MATRIX, VECTOR, VECTOR))
 def column_units(matrix, typical, columns, mask, logs, rows, scratch):
-    """Store in `columns` (n_q) units of the coordinates that make the entries of C_q (`matrix`) similar in size.
+    """Store in `columns` (n_q) units of the coordinates in which the entries of C_q (`matrix`) have similar sizes.
 
-    The units minimize the sum over all entries of log(|entry (i, j)| * unit of coordinate j / unit of row i)^2. The
-    units have a common factor, so that their median ratio to `typical` (n_q) is 1. A coordinate without entries gets
-    its unit from `typical`. The last four arguments are scratch.
+    The units minimize the sum of log(|entry (i, j)| * unit of coordinate j / unit of row i)^2 over all nonzero entries.
+    This leaves a common factor free, which is chosen so that the median ratio of units to `typical` (n_q, typical sizes
+    of the coordinates) is 1. A coordinate without nonzero entries gets the unit `typical`. Other arguments are scratch.
     """
     n_used, log_factor = 0, 0.0
     for i in range(rows.size):
@@ -103,10 +104,10 @@ def column_units(matrix, typical, columns, mask, logs, rows, scratch):
 def linear_ranges(coordinates_in_units, radius, negligible, scratch, ranges):
     """Store in `ranges` the distance over which each row of C_q changes little, in units of the coordinates.
 
-    Row i of `coordinates_in_units` has the coordinates with an entry in row i, else 0. `radius`: norms of the rows,
-    divided by their change per unit displacement. The distance is the row's radius if this radius is at most 1, or at
-    most the largest coordinate in the row. Otherwise the distance is the lower median of the row's coordinates that are
-    not NEGLIGIBLE, or 1 if none exceeds `negligible`.
+    Row i of `coordinates_in_units` contains |q_j| in its unit where row i of C_q has a nonzero entry j, else 0.
+    `radius`: norm of each row, divided by its change per unit displacement. If this radius is at most 1, or at most the
+    largest |q_j| of the row, the distance is the radius. Else it is the lower median of the row's |q_j| that are not
+    NEGLIGIBLE, or 1 if no |q_j| of the row exceeds `negligible`.
     """
     for i in range(ranges.size):
         largest, n = 0.0, 0
@@ -124,13 +125,13 @@ def linear_ranges(coordinates_in_units, radius, negligible, scratch, ranges):
             ranges[i] = scratch[(n - 1) // 2]
 
 
-# flags that evaluate_start returns. WELL_FORMED: all values are finite, M is symmetric, no row is empty. CONSISTENT:
-# the state satisfies the constraints up to rounding. DEFINITE: M varies, and all its eigenvalues exceed their limit by
-# the factor EIGENVALUE_MARGIN. INDEFINITE: M varies, and an eigenvalue is below its limit by this factor
+# flags that `evaluate_start` returns. WELL_FORMED: all values are finite, M is symmetric, no row of C_q or A is zero.
+# CONSISTENT: the state satisfies the constraints up to rounding. Eigenvalues of M are judged by a limit if M varies.
+# DEFINITE: all exceed limit * EIGENVALUE_MARGIN. INDEFINITE: one is below limit / EIGENVALUE_MARGIN
 WELL_FORMED, CONSISTENT, DEFINITE, INDEFINITE = 1, 2, 4, 8
-MAX_RELATIVE_DISTANCE = 0.5  # sizes recorded at a position apply up to this distance from it, relative to the sizes
-ROUNDING_OF_ZERO = 2.0**-52  # coordinates up to this size, relative to the largest, may be rounding errors of zero
-EIGENVALUE_MARGIN = 2.0  # eigenvalues must differ from their limit by this factor, so that rounding does not decide
+MAX_RELATIVE_DISTANCE = 0.5  # recorded sizes of coordinates are used at positions within this fraction of these sizes
+ROUNDING_OF_ZERO = 2.0**-52  # a coordinate up to this fraction of the largest one may be zero with a rounding error
+EIGENVALUE_MARGIN = 2.0  # if the least eigenvalue of M is within this factor of its limit, other checks must decide
 
 
 def results_size(n: int, n_c: int, n_a: int) -> int:
@@ -155,7 +156,7 @@ def _has_empty_row(rows):
 
 @exact
 def _is_symmetric(mass, tolerance):
-    """Return whether M is symmetric, up to differences of `tolerance` times max|M|."""
+    """Return whether M is symmetric, up to differences of `tolerance` times max|M_ij|."""
     largest, asymmetry, is_exactly_symmetric = 0.0, 0.0, True
     for i in range(len(mass)):
         for j in range(i):
@@ -170,13 +171,13 @@ def _is_symmetric(mass, tolerance):
 
 @exact
 def _is_rounding_error(value, row, state, sizes, min_size, rate, tolerance):
-    """Return whether the constraint `value` is a rounding error: at most `tolerance` times the sum of its |terms|.
+    """Return True if `value`, the violation of a constraint, is at most `tolerance` times the sum of its |terms|.
 
-    The terms are `rate` and row[j] * state[j] for all j; |state[j]| counts as at least sizes[j] and `min_size`.
+    The terms are `rate` and row[j] * state[j] for all j, where |state[j]| counts as at least sizes[j] and `min_size`.
     """
     sum_of_terms = abs(rate)
     for j in range(state.size):
-        if row[j] != 0.0:  # most entries are zero
+        if row[j] != 0.0:  # faster, because most entries are zero
             sum_of_terms += abs(row[j]) * max(abs(state[j]), sizes[j], min_size)
     return abs(value) <= tolerance * sum_of_terms
 
@@ -192,7 +193,7 @@ def _is_near(q, sizes, stored_q):
 
 @exact
 def _has_same_entries(rows, entries):
-    """Return whether `rows` is nonzero exactly where `entries`, a matrix stored row by row, is nonzero."""
+    """Return whether `rows` and `entries`, a matrix stored row by row, have nonzero entries at the same places."""
     is_same, n = True, rows.shape[1]
     for i in range(entries.size // n):
         largest = largest_of(rows[i])
@@ -203,7 +204,7 @@ def _has_same_entries(rows, entries):
 
 @exact
 def _index_of_near_position(q, rows, n_c, records):
-    """Return the index in `records` (see `evaluate_start`) where the record of a position near q begins; -1: none."""
+    """Return the index in `records` (see `evaluate_start`) where the record for a position near q begins; -1: none."""
     n = q.size
     stride = 2 * n + n_c * n
     for k in range(0, records.size, stride):
@@ -216,11 +217,11 @@ def _index_of_near_position(q, rows, n_c, records):
 
 @exact
 def _is_consistent(C, rate, rows, q, v, records, tolerance):
-    """Return whether (q, v) satisfies the constraints up to rounding; `rows`: C_q with A, `rate`: C_t with b.
+    """Return whether (q, v) satisfies the constraints up to rounding errors; `rows`: [C_q; A], `rate`: C_t and b.
 
-    The size of a coordinate counts as at least its size in `records` (see `evaluate_start`), and at least the rounding
-    error of the largest coordinate. Otherwise a constraint would not be small relative to its terms if its
-    coordinates are all rounding errors of zero, such as coordinates normal to the plane of a planar motion.
+    A violation is compared with the terms of its constraint. For this, the size of a coordinate counts as at least its
+    size in `records` (see `evaluate_start`), and at least the rounding error of the largest coordinate. Else a
+    constraint on coordinates that are zero up to rounding, such as those normal to a plane of motion, seems violated.
     """
     fastest, rounding = largest_of(v), ROUNDING_OF_ZERO * largest_of(q)
     begin = _index_of_near_position(q, rows, C.size, records)
@@ -241,13 +242,13 @@ def _is_consistent(C, rate, rows, q, v, records, tolerance):
 def _record_entries(rows, pattern):
     for i in range(len(rows)):
         for j in range(rows.shape[1]):
-            # the store is unconditional, so that LLVM vectorizes the loop
+            # all entries are stored, even unchanged ones: without a branch, LLVM vectorizes the loop
             pattern[i, j] = 1.0 if rows[i, j] != 0.0 else pattern[i, j]
 
 
 @exact
 def _record_entries_at_displacements(f, t, q, shifts, position, rows, n_c, pattern):
-    """Set `pattern` to 1 where C_q or A is nonzero at a position q + max|q| shifts[k]; `position`, `rows`: scratch."""
+    """Set `pattern` to 1 where [C_q; A] is nonzero at a position q + max|q| shifts[k]; `position`, `rows`: scratch."""
     largest = largest_of(q)
     for k in range(len(shifts)):
         for j in range(q.size):
@@ -260,7 +261,7 @@ def _record_entries_at_displacements(f, t, q, shifts, position, rows, n_c, patte
 
 @exact
 def _is_definite(mass, min_eigenvalue, factors):
-    """Return whether all eigenvalues of M are larger than `min_eigenvalue` times max|M|; `factors` is scratch."""
+    """Return whether all eigenvalues of M exceed `min_eigenvalue` times max|M_ij|; `factors` is scratch."""
     n, largest = len(mass), 0.0
     for i in range(n):
         for j in range(n):
@@ -275,18 +276,18 @@ def _is_definite(mass, min_eigenvalue, factors):
 def evaluate_start(f, t, q, v, records, lam, results, mass, rows, shifts, pattern, roundings):
     """Evaluate all callbacks at (t, q, v), and store their results; return the sum of the flags that apply.
 
-    The flags are WELL_FORMED, CONSISTENT, DEFINITE and INDEFINITE. Arguments:
+    The flags are WELL_FORMED, CONSISTENT, DEFINITE and INDEFINITE; 0 if a value is not finite. Arguments:
 
-    - roundings: allowed relative rounding errors of constraints, of the symmetry of M, and of the eigenvalues of M
-    - records: for each of several positions, the size of each coordinate, the position, and where C_q is nonzero (see
-      `keep` of checks/scales.py). Near such a position, a coordinate counts as at least its recorded size when rounding
-      errors of constraints are judged
-    - shifts: displacements of q, relative to max|q|, at which nonzero entries of C_q and A are also recorded
-    - mass, rows, pattern: zeros on entry; on return M, C_q with A, and 1 where rows are nonzero
-    - results: `results_size` zeros on entry; on return the force, C, C_t with b, other results, and scratch
+    - roundings: relative limits of the violation of constraints, the asymmetry of M, and the eigenvalues of M
+    - records: for each of several positions, n_q sizes of coordinates, the position (n_q), and 1 where C_q is nonzero,
+      else 0 (n_c n_q), see `keep` of checks/scales.py. `_is_consistent` uses them
+    - lam: multipliers for the callback `reaction_by_q`
+    - shifts: displacements of q, relative to max|q|, at which nonzero entries of [C_q; A] are also recorded
+    - mass, rows, pattern: zeros on entry; on return M, [C_q; A], and 1 where [C_q; A] is nonzero, else 0
+    - results: `results_size` zeros on entry; on return the force, C, the rates C_t and b, other results, and scratch
     """
     n, n_c, n_rows = q.size, lam.size, rows.shape[0]
-    # indices in `results` at which the force, C, the rates (C_t, b) and Gamma end
+    # `results` contains the force, C, the rates C_t and b, and Gamma, one after the other: indices at which these end
     force, C, rate, gamma = n, n + n_c, n + n_c + n_rows, n + n_c + 2 * n_rows
     f.mass(t, q, f.p, mass)
     f.force(t, q, v, f.p, results[:force])
@@ -328,7 +329,7 @@ def evaluate_start(f, t, q, v, records, lam, results, mass, rows, shifts, patter
         result_flags = WELL_FORMED
         if _is_consistent(results[force:C], results[C:rate], rows, q, v, records, roundings[0]):
             result_flags |= CONSISTENT
-    if f.constant_mass == 0:  # if the smallest eigenvalue is within the margin, neither flag is set
+    if f.constant_mass == 0:  # if the smallest eigenvalue is within EIGENVALUE_MARGIN of its limit, set neither flag
         if _is_definite(mass, EIGENVALUE_MARGIN * roundings[2], scratch):
             result_flags |= DEFINITE
         elif not _is_definite(mass, roundings[2] / EIGENVALUE_MARGIN, scratch):
@@ -343,7 +344,7 @@ def evaluate_start(f, t, q, v, records, lam, results, mass, rows, shifts, patter
 
 @kernel(types.void(KIT, f8, MATRIX, i8, MATRIX))
 def rows_at_positions(f, t, positions, n_c, rows):
-    """Store in `rows` (zero on entry) C_q (n_c rows) and A at each of the `positions`, one after another."""
+    """Store in `rows` (zero on entry) C_q (n_c rows) and A for the first of `positions`, then for the second, ..."""
     n_rows = len(rows) // len(positions)
     for k in range(len(positions)):
         begin = k * n_rows
@@ -353,7 +354,7 @@ def rows_at_positions(f, t, positions, n_c, rows):
 
 @exact
 def _is_close(fused, separate, tolerance, rounding_errors):
-    """Return whether entries (i, j) of both matrices differ by up to tolerance * max|separate| + rounding_errors[i]."""
+    """Return whether all entries (i, j) of two matrices agree up to tolerance * max|separate| + rounding_errors[i]."""
     largest = 0.0
     for i in range(separate.shape[0]):
         for j in range(separate.shape[1]):
@@ -367,10 +368,11 @@ def _is_close(fused, separate, tolerance, rounding_errors):
 
 @kernel(types.boolean(KIT, f8, VECTOR, VECTOR, MATRIX, MATRIX, VECTOR, f8, f8))
 def kinematics_agree(f, t, q, v, fused, separate, roundings, tolerance, rounding):
-    """Return whether `kinematics` agrees with the separate callbacks, up to `tolerance` times the largest result.
+    """Return whether the callback `kinematics` agrees with the callbacks for C, C_t, gamma and C_q.
 
-    Values of C may also differ by `rounding` times the sum of their |terms|. `fused` and `separate`, (3 + n_q, n_c),
-    are zero on entry, and contain C, C_t, gamma and C_q on return; `roundings` (n_c), zero on entry, is scratch.
+    Differences of up to `tolerance` times the largest value of each of the four are allowed; for C_i, also `rounding`
+    times the sum of |C_q[i, j] q_j| over j. On return, `fused` (by `kinematics`) and `separate` (by the others) contain
+    C, C_t, gamma and C_q. Both (3 + n_q, n_c) and `roundings` (n_c, scratch) are zero on entry.
     """
     n, n_c = q.size, roundings.size
     fused_rows, separate_rows = fused[3:].reshape((n_c, n)), separate[3:].reshape((n_c, n))
@@ -390,17 +392,17 @@ def kinematics_agree(f, t, q, v, fused, separate, roundings, tolerance, rounding
     return is_close and _is_close(fused[:1].reshape((n_c, 1)), separate[:1].reshape((n_c, 1)), tolerance, roundings)
 
 
-VALUE, BOUND = range(2)  # rows of `nodes`: values of the nodes of a program, and bounds of their rounding errors
+VALUE, BOUND = range(2)  # rows of `nodes`: results of the operations of a trace, and bounds of their rounding errors
 
 EPS = 2.0**-52
-# largest difference between a callback and its trace, apart from rounding, relative to the callback's largest value
+# largest allowed difference of a callback and its trace, apart from rounding, relative to the callback's largest value
 MAX_DIFFERENCE = 1e-9
-ROUNDING_FACTOR = 200.0 * EPS  # accepted rounding error of a traced number, relative to its entry in `bounds`
+ROUNDING_FACTOR = 200.0 * EPS  # allowed rounding error of a traced number, divided by its error bound in `bounds`
 
 
 @exact
 def _sum_with_bound(columns, coefficients, constant, nodes, begin, end):
-    """Return constant + sum of coefficient * node over the terms begin to end - 1, and the error bound of this sum."""
+    """Return constant + sum of coefficients[k] * nodes[VALUE, columns[k]], begin <= k < end, and its error bound."""
     total, bound = constant, abs(constant)
     for k in range(begin, end):
         term = coefficients[k] * nodes[VALUE, columns[k]]
@@ -411,7 +413,7 @@ def _sum_with_bound(columns, coefficients, constant, nodes, begin, end):
 
 @exact
 def _operation_with_bound(kind, x, bound_x, y, bound_y):
-    """Return the result of an operation on x and y, and its error bound, from the error bounds of x and y."""
+    """Return the result of the operation `kind` on x and y, and its error bound by the bounds of x and y."""
     z = result_of_operation(kind, x, y)
     if kind == op.PRODUCT:
         bound = abs(x) * bound_y + abs(y) * bound_x
@@ -433,9 +435,10 @@ def _operation_with_bound(kind, x, bound_x, y, bound_y):
 
 @exact
 def _run_trace(program, columns, coefficients, constants, nodes, values, bounds):
-    """Run a traced program: store its results in `values`, and their error bounds, in units of EPS, in `bounds`.
+    """Run a trace: store its results in `values`, and bounds of their rounding errors, in units of EPS, in `bounds`.
 
-    `nodes` contains the inputs t, q and v first, and receives the other nodes.
+    `program`, `columns`, `coefficients` and `constants` describe its operations. On entry, `nodes` begins with t, q and
+    v; the results of all operations are added to it.
     """
     for i in range(len(program)):
         first, second, end = program[i, op.FIRST], program[i, op.SECOND], program[i, op.END]
@@ -450,7 +453,7 @@ def _run_trace(program, columns, coefficients, constants, nodes, values, bounds)
 
 @exact
 def _count_differences(called, traced, bounds):
-    """Return how many entries of `called` are not finite, or differ from `traced` (limit: see `compare_traces`)."""
+    """Return how many entries of `called` are not finite, or differ from `traced`, as `compare_traces` defines it."""
     count = 0
     for i in range(called.shape[1]):
         largest = 0.0
@@ -471,10 +474,11 @@ def compare_traces(
 ):
     """Compare callbacks with their traces at `states`, which has rows [t, q, v]; return how many numbers differ.
 
-    Two numbers differ if their difference exceeds MAX_DIFFERENCE times the largest value at these states, plus
-    ROUNDING_FACTOR times the error bound of the traced number. `sizes`: n_q, n_c and n_a. `is_compared`: 1 for each of
-    KINDS in traced_values.py that has to be compared. Store the values of callbacks in `called` (zero on entry), the
-    values of traces in `traced`, and the error bounds of these in `bounds`; `nodes` is scratch.
+    Two numbers count as different if they differ by more than MAX_DIFFERENCE times the largest value of the callback's
+    entry at these states, plus ROUNDING_FACTOR times the error bound of the traced number. `sizes`: n_q, n_c and n_a.
+    `is_compared`: 1 for each of KINDS in traced_values.py that is compared, else 0. The trace is given by `program`,
+    `columns`, `coefficients` and `constants`. On return, `called` (zero on entry) contains values by callbacks,
+    `traced` values by the trace, and `bounds` the error bounds of `traced`. `nodes` is scratch.
     """
     n, n_c, n_a = sizes[0], sizes[1], sizes[2]
     for k in range(len(states)):

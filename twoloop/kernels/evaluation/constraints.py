@@ -1,9 +1,8 @@
-"""Evaluate the rows G of the constraints, their rates C_t and b, and by finite differences the right-hand side Gamma.
+"""Evaluate the rows G = [C_q; A] of the constraints, their rates C_t and b, and Gamma by finite differences.
 
-The first rows of G are C_q, from C(t, q) = 0; the other rows are A, from A v + b = 0 (`f`: kit, `w`: workspace).
-
-Gamma, the right-hand side of G a = Gamma, is a derivative along the motion. Two central differences, with the steps e
-and 2 e (s), yield Gamma to order 4. The step e is chosen by the estimated error: the disagreement of the differences.
+C_q belongs to constraints C(t, q) = 0, A to constraints A v + b = 0, so that G v + (C_t, b) = 0. The derivative of this
+equation along the motion is G a = Gamma for accelerations a. Two central differences, with the time steps e and 2 e,
+yield Gamma to order 4. Their disagreement estimates the error, by which e is chosen (`f`: kit, `w`: workspace).
 """
 
 import numpy as np
@@ -16,7 +15,7 @@ from twoloop.kernels.linalg.dense import copy, largest_of
 
 @merged
 def constraint_rows(f, w, t, q, G):
-    """Store C_q and A at (t, q) in G, which is w.G or w.Gx and contains zeros on entry."""
+    """Store the constraint Jacobian [C_q; A] at (t, q) in G, which is w.G or w.Gx and contains zeros on entry."""
     n_c, n_rows = w.C.size, w.Rate.size
     if n_c > 0 and not jacobian_by_program(f, w, t, q, G):
         f.jacobian(t, q, f.p, G[:n_c])
@@ -26,7 +25,7 @@ def constraint_rows(f, w, t, q, G):
 
 @merged
 def clear_rows(f, w):
-    """Set w.G to zero; in the augmented form, clear recorded entries only (the task VERIFY_PATTERN detects others)."""
+    """Set the constraint Jacobian w.G to zero; in the augmented form, set only the entries in w.row_entries to zero."""
     if f.form == AUGMENTED:
         for i in range(w.Rate.size):
             for k in range(w.row_entries[i], w.row_entries[i + 1]):
@@ -37,7 +36,7 @@ def clear_rows(f, w):
 
 @merged
 def row_residual(w, v, rows):
-    """Store in w.z the residuals G v + (C_t, b) of the rows with the indices `rows`, from G and the rates in w."""
+    """Store in w.z the violations G v + (C_t, b) of constraints `rows` by velocities v; w contains G, C_t and b."""
     for k in range(rows.size):
         row = rows[k]
         total = w.Rate[row]
@@ -48,7 +47,7 @@ def row_residual(w, v, rows):
 
 @merged
 def constraint_rates(f, w, t, q, rate):
-    """Store C_t and b at (t, q) in `rate`."""
+    """Store the constraint rates C_t (for C(t, q) = 0) and b (for A v + b = 0) at (t, q) in `rate`."""
     n_c, n_rows = w.C.size, w.Rate.size
     rate[:] = 0.0
     if f.constraint_rate_given == 1:
@@ -59,7 +58,7 @@ def constraint_rates(f, w, t, q, rate):
 
 @merged
 def kinematics(f, w, t, q, v):
-    """Store in w C, C_q with A, C_t with b, and Gamma of the rows of C_q, by the callback that computes all of them."""
+    """Store C, C_q, C_t and Gamma for C(t, q) = 0 in w by the callback `kinematics`; A and b by other callbacks."""
     n_c, n_rows = w.C.size, w.Rate.size
     clear_rows(f, w)
     w.C[:] = 0.0
@@ -74,7 +73,7 @@ def kinematics(f, w, t, q, v):
 
 @merged
 def gather_independent_columns(G, rate, rows, independent, D):
-    """Store right-hand sides for the matrix G_d in the rows of D: -G_j for each independent column j; last, -`rate`."""
+    """Store in D a row -G[rows, j] for each independent column j, and last -rate[rows]: right-hand sides for G_d."""
     for j in range(independent.size):
         column = independent[j]
         for k in range(rows.size):
@@ -83,42 +82,41 @@ def gather_independent_columns(G, rate, rows, independent, D):
         D[independent.size, k] = -rate[rows[k]]
 
 
-# a step of a finite difference is at most MAX_DIFFERENCE_STEP s, and so short that q changes by at most
-# MAX_DIFFERENCE_STEP max|q|; but this second limit makes it no shorter than MIN_STEP_RATIO times MAX_DIFFERENCE_STEP s
+# `largest_difference_step` is at most MAX_DIFFERENCE_STEP (s) and, in fast motion, at least MIN_STEP_RATIO times this
 MAX_DIFFERENCE_STEP, MIN_STEP_RATIO = 2e-4, 1e-4
-N_DIFFERENCE_STEPS = 12  # number of steps that _choose_difference_step tries, each a quarter of the previous step
-ROUNDING_DISAGREEMENT = 1e-9  # due to rounding, Gamma with the steps e and 2 e may differ by this fraction
-# if Gamma with the steps e and 2 e differs by less than this fraction, e is doubled, to reduce rounding errors
+N_DIFFERENCE_STEPS = 12  # number of time steps that `_choose_difference_step` tries, each a quarter of the previous one
+ROUNDING_DISAGREEMENT = 1e-9  # due to rounding, Gamma with time steps e and 2 e may differ by this part of GAMMA_SCALE
+# if Gamma with time steps e and 2 e differs by less than this part of GAMMA_SCALE, e is doubled: less rounding error
 NEGLIGIBLE_DISAGREEMENT = 1e-11
-# weights of the values at 0, e, 2 e and 4 e in one-sided differences of order 2, with the steps e and 2 e
+# weights of values at the times 0, e, 2 e and 4 e in one-sided differences of order 2; COARSE: with the step 2 e
 ONE_SIDED_WEIGHTS, ONE_SIDED_WEIGHTS_COARSE = (-1.5, 2.0, -0.5, 0.0), (-0.75, 0.0, 1.0, -0.25)
-ONE_SIDED_STEP_RATIO = 1.0 / 16.0  # step of one-sided differences (order 2), relative to central differences (order 4)
-# rounding error of Gamma if terms of G v cancel, relative to the largest term divided by the largest step
+ONE_SIDED_STEP_RATIO = 1.0 / 16.0  # ratio of the time step of one-sided differences to that of central differences
+# if terms of G v cancel, the rounding error of Gamma is about this multiple of (largest |term| / largest time step)
 ROUNDING_OF_TERMS = 1e-14
-CONVERGED_CHANGE = 0.01  # the search for a step ends if Gamma changes by less than this part of the required accuracy
+CONVERGED_CHANGE = 0.01  # the search for a time step ends if Gamma changes by at most this part of its allowed error
 
 
 @exact
 def representable_step(t, h):
-    """Return (t + h) - t, the step nearest to h that floating-point times allow (multiples of 1.2e-7 s near 1e9 s)."""
+    """Return the step (t + h) - t: the difference of floating-point times (1.2e-7 s apart near 1e9 s) closest to h."""
     return (t + h) - t
 
 
 @merged
 def largest_difference_step(q, v):
-    """Return the largest difference step e (s): MAX_DIFFERENCE_STEP, or less if the coordinates move fast.
+    """Return the largest time step e (s) of finite differences: MAX_DIFFERENCE_STEP, or less if coordinates move fast.
 
-    In the time e, coordinates move by at most MAX_DIFFERENCE_STEP times max|q|, unless MIN_STEP_RATIO limits e.
+    In the time e, they move by at most MAX_DIFFERENCE_STEP / (1 s) times max|q|, unless MIN_STEP_RATIO limits e.
     """
     size, speed = largest_of(q), largest_of(v)
     if speed <= size:
         return MAX_DIFFERENCE_STEP
-    return MAX_DIFFERENCE_STEP * max(size / speed, MIN_STEP_RATIO)  # size / speed is 0 if q is 0
+    return MAX_DIFFERENCE_STEP * max(size / speed, MIN_STEP_RATIO)  # (size is 0 if q is 0)
 
 
 @merged
 def _difference_side(w, t, e):
-    """Return where to take differences: 1 (after t) or -1 (before t), if C_t or b jumps on the other side; 0: both."""
+    """Return 1 (-1) if differences may only use times after (before) t, because C_t or b jumps within 2 e; else 0."""
     since_jump, until_jump = t - w.last_jump, w.next_jump - t
     if min(since_jump, until_jump) >= 2.0 * e:
         return 0.0
@@ -127,9 +125,9 @@ def _difference_side(w, t, e):
 
 @compiled
 def _fill_gamma(f, w, t, q, v, e, first, last):
-    """Store Gamma[first:last] in w.Gamma, by differences with the steps e and 2 e; return three maxima.
+    """Store Gamma[first:last] in w.Gamma, extrapolated from differences with the time steps e and 2 e; return 3 maxima.
 
-    The maxima are max|Gamma|, the largest disagreement of the two differences, and the largest |term| in the sums G v.
+    They are the largest |Gamma_i|, the largest difference between both values of Gamma_i, and the largest |G_ij v_j|.
     If Gamma is not finite, the first two are NaN.
     """
     Gamma_coarse = w.Gamma_tried[0]
@@ -172,16 +170,17 @@ def _fill_gamma(f, w, t, q, v, e, first, last):
 
 @merged
 def _max_disagreement(w):
-    """Return the largest accepted difference between Gamma with the steps e and 2 e; the error of Gamma is smaller."""
+    """Return the largest allowed difference between Gamma with e and with 2 e; the error of Gamma is smaller."""
     return max(w.gamma_required, ROUNDING_DISAGREEMENT) * w.gamma_scale
 
 
 @compiled
 def _choose_difference_step(f, w, t, q, v, largest_step, first, last):
-    """Store Gamma[first:last] in w.Gamma, by differences with the best of several steps; return a code.
+    """Store Gamma[first:last] in w.Gamma, by differences with the best of several time steps e.
 
-    Steps are divided by 4 until Gamma changes little. The best step is the one at which Gamma changes least; it is
-    stored as GAMMA_STEP_RATIO. The code is GAMMA_INACCURATE if even this smallest change is too large, else DONE.
+    Beginning with `largest_step`, e is divided by 4 until Gamma changes little. The best e is the one at which Gamma
+    changes least. Its ratio to `largest_step` is stored in w.gamma_step_ratio. Return GAMMA_INACCURATE if even this
+    least change is larger than the allowed error, else DONE.
     """
     least_change = np.inf
     step_ratio = 1.0
@@ -210,19 +209,19 @@ def _choose_difference_step(f, w, t, q, v, largest_step, first, last):
 
 @compiled
 def gamma_by_differences(f, w, t, q, v, first, last):
-    """Store Gamma[first:last] in w.Gamma, by differences; return DONE, or GAMMA_INACCURATE if no step is accurate.
+    """Store Gamma[first:last] in w.Gamma, by differences; return DONE, or GAMMA_INACCURATE if no time step is accurate.
 
-    Gamma = -d/de [G v + (C_t, b)](t + e, q + e v) at e = 0.
+    Gamma = -d/de [G v + (C_t, b)](t + e, q + e v) at e = 0, where v is constant.
 
-    Errors are relative to the largest entry of Gamma so far in this run. The step e is GAMMA_STEP_RATIO times
-    largest_difference_step; a new one is chosen if differences with e and 2 e disagree, as for kilohertz drives.
+    Errors are relative to w.gamma_scale, the size of Gamma so far. The time step e is w.gamma_step_ratio times
+    `largest_difference_step`. If Gamma with e and with 2 e differ too much (kilohertz drives), choose a new ratio.
     """
     largest_step = largest_difference_step(q, v)
     e = representable_step(t, w.gamma_step_ratio * largest_step)
     if e > 0.0:
         largest, disagreement, terms = _fill_gamma(f, w, t, q, v, e, first, last)
         if np.isnan(largest) or disagreement == 0.0 or w.gamma_scale == 0.0:
-            return DONE  # Gamma is not finite, which the caller reports, or there is no scale yet to judge errors by
+            return DONE  # the caller reports values that are not finite; without a scale, errors cannot be judged yet
         rounding = ROUNDING_OF_TERMS * terms / largest_step
         w.gamma_scale = max(w.gamma_scale, largest, rounding / w.gamma_required)
         if disagreement < NEGLIGIBLE_DISAGREEMENT * w.gamma_scale:

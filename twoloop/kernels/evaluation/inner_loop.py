@@ -1,11 +1,13 @@
 """Evaluate accelerations, and move states onto the constraints: the inner loop, which the steps of all methods call.
 
-The inner loop is compiled once, as one function, and passed to steps in a `Kit`; steps call it through the functions at
-the end of this file, one for each task. Accelerations and multipliers follow from eqs. (6)-(8) of the paper.
+The inner loop is compiled once, as one function, which the kit `f` contains; steps call it through the functions at the
+end of this file, one for each task. Accelerations a and multipliers lam follow from eqs. (6)-(8) of the paper:
+M a + G^T lam = Q (Q: forces), G a = Gamma. G = [C_q; A] contains the Jacobian C_q of constraints on positions and the
+rows A of non-holonomic constraints A v + b = 0; w.D contains the null space of G. `w` is the workspace.
 
-If a step integrates all coordinates, its states are off the constraints by the error of the formula. One pass of a
-projection moves positions and velocities to the nearest state on the constraints, in the metric of M, which does not
-depend on the partition. After a pass, the error of positions is about the square of their correction. The errors of
+If a step integrates all coordinates, its states violate the constraints by the error of the formula. Each pass of a
+projection moves positions and velocities towards the nearest state on the constraints, in the metric of M, which does
+not depend on the partition. After a pass, the error of positions is about the square of their correction. The errors of
 velocities and accelerations are about as large as the correction: passes are repeated until it is near rounding.
 """
 
@@ -56,7 +58,7 @@ def compute_gamma(f, w, t, q, v):
     if w.has_gamma == 1.0 and n_rows == n_c:
         return DONE
     has_gamma, has_gamma_a = f.gamma_given == 1, f.nonholonomic_gamma_given == 1
-    first, last = 0, n_rows  # range of the rows of Gamma that no callback computes
+    first, last = 0, n_rows  # no callback computes the rows of Gamma from `first` to `last` - 1
     w.Gamma[:] = 0.0
     if has_gamma:
         f.gamma(t, q, v, f.p, w.Gamma[:n_c])
@@ -81,7 +83,7 @@ def mass_matrix(f, w, t, q):
 
 @merged
 def factor_mass_at(f, w, t, q):
-    """Store M(t, q) in w.M, and the factors of M in w.L if the form of the equations uses them; return a code."""
+    """Store M(t, q) in w.M and, if the equations use them, its factors in w.L; return DONE or a failure code."""
     w.factored = 0.0
     mass_matrix(f, w, t, q)
     code = factor_mass(f, w) if f.form == MULTIPLIERS or has_banded_mass(f) else DONE
@@ -90,7 +92,7 @@ def factor_mass_at(f, w, t, q):
 
 @merged
 def factor_equations_at(f, w, t, q):
-    """Factor the linear system for accelerations at (t, q), given the rows and (if NULL_SPACE) w.D; return a code."""
+    """Factor the equations for accelerations, given the Jacobian w.G and null space w.D; return DONE or a failure code."""
     if f.constant_mass == 0:
         w.factored = 0.0
         mass_matrix(f, w, t, q)
@@ -102,7 +104,7 @@ def factor_equations_at(f, w, t, q):
 
 @merged
 def compute_accelerations(f, w, t, q, v, a):
-    """Compute the accelerations `a` at (q, v), given the rows, their factors and (if NULL_SPACE) w.D; return a code."""
+    """Store the accelerations at (q, v) in `a`, given `_factor_rows_at` at q in w; return DONE or a failure code."""
     w.n_evaluations += 1
     code = factor_equations_at(f, w, t, q)
     if code == DONE:
@@ -123,7 +125,7 @@ def compute_accelerations(f, w, t, q, v, a):
 
 @compiled
 def _record_gamma_scale(w, a):
-    """Increase GAMMA_SCALE, the scale of errors of Gamma, to at least the largest sum over j of |G_ij a_j|."""
+    """Raise w.gamma_scale, the size to which errors of Gamma are compared, to the largest sum over j of |G_ij a_j|."""
     for i in range(w.Rate.size):
         total = 0.0
         for p in range(w.row_entries[i], w.row_entries[i + 1]):
@@ -133,7 +135,7 @@ def _record_gamma_scale(w, a):
 
 @merged
 def compute_multipliers(f, w, a, lam):
-    """Store in lam the multipliers of all rows: G^T lam = Q - M a. If rows are redundant, lam has the least norm."""
+    """Store the multipliers of all rows in lam: G^T lam = Q - M a; if rows are redundant, those of least norm."""
     lam[:] = 0.0
     saddle_point.multipliers(f, w, w.Q, a, lam)
     if w.rows_v.size < lam.size:
@@ -142,9 +144,10 @@ def compute_multipliers(f, w, a, lam):
 
 @merged
 def _factor_rows_at(f, w, t, q, v):
-    """Store in w the rows of G at q, their factors and, for NULL_SPACE, the null space w.D; return a code.
+    """Store in w the constraint Jacobian at q and the factors of its dependent columns; return DONE or a failure code.
 
-    The callback `kinematics` also computes Gamma, which depends on v. The state (q, v) may be off the constraints.
+    In the form NULL_SPACE, also store its null space; with the callback `kinematics`, also Gamma at (q, v).
+    The state (q, v) may violate the constraints.
     """
     if f.kinematics_given == 1:
         kinematics(f, w, t, q, v)
@@ -159,14 +162,14 @@ def _factor_rows_at(f, w, t, q, v):
 
 @merged
 def compute_accelerations_at(f, w, t, q, v, a):
-    """Store in `a` the accelerations at the state (q, v), which may be off the constraints; return a code."""
+    """Store the accelerations at (q, v), which may violate the constraints, in `a`; return DONE or a failure code."""
     code = _factor_rows_at(f, w, t, q, v)
     return compute_accelerations(f, w, t, q, v, a) if code == DONE else code
 
 
 @merged
 def _find_least_correction(f, w):
-    """Store in w.y the least correction x, in the metric of M, with G x = w.g; return max|x|, or inf if not finite."""
+    """Store in w.y the x of least x^T M x with G x = w.g (G: constraint Jacobian); return max|x|; inf: not finite."""
     w.Q[:] = 0.0
     solve(f, w, w.Q, w.g, w.y)
     largest = 0.0
@@ -179,7 +182,7 @@ def _find_least_correction(f, w):
 
 @merged
 def _find_corrections(f, w, v):
-    """Correct v in place by the factors at q, and store the correction of q in w.y; return max|corrections|."""
+    """Correct v in place, and store the correction of q in w.y; return the largest |correction| of q, and that of v."""
     rows, n_c = w.rows_v, w.C.size
     row_residual(w, v, rows)
     for i in range(rows.size):
@@ -194,13 +197,13 @@ def _find_corrections(f, w, v):
 
 @merged
 def project_state(f, w, t, q, v, theta, a, lam):
-    """Project (q, v) onto the constraints in place, store accelerations in `a` and multipliers in lam; return a code.
+    """Project (q, v) onto the constraints; store accelerations `a` and multipliers lam; return DONE or a failure code.
 
     Rows of A constrain velocities only; positions are corrected in directions that these rows allow.
 
-    The last pass corrects positions by at most theta, and velocities by at most theta max(1, max|v|). Passes also end
-    after a correction of positions of at most theta times the smallest pivot: the inverse of this pivot bounds how fast
-    tangents turn, so that velocities are accurate, too.
+    Passes end after one that corrects positions by at most theta, and velocities by at most theta max(1, max|v|). They
+    also end after one that corrects positions by at most theta times w.pivot, the smallest pivot of C_q. Velocities are
+    then accurate, too: the directions that constraints allow turn at most at a rate of about 1 / w.pivot.
     """
     last_correction = np.inf
     theta = max(theta, MIN_CORRECTION * w.rounded)
@@ -214,7 +217,7 @@ def project_state(f, w, t, q, v, theta, a, lam):
             w.C[:] = 0.0
             f.constraint(t, q, f.p, w.C)
         w.n_inner += 1
-        # with NULL_SPACE, find_null_space has already evaluated the rates
+        # in the form NULL_SPACE, find_null_space has already stored C_t and b in w.Rate
         if f.kinematics_given == 0 and f.form != NULL_SPACE:
             constraint_rates(f, w, t, q, w.Rate)
         correction_q, correction_v = _find_corrections(f, w, v)
@@ -223,10 +226,10 @@ def project_state(f, w, t, q, v, theta, a, lam):
         has_converged = correction_q <= theta and correction_v <= theta * max(1.0, largest_of(v))
         is_last = has_converged or correction_q <= w.pivot * theta
         if not has_converged:
-            w.has_gamma = 0.0  # Gamma was computed at the old velocities: compute it again
+            w.has_gamma = 0.0  # Gamma in w belongs to the old velocities: compute it again
         if not is_last and correction_q > CONTRACTION * last_correction:
             if is_rounding_of_positions(w, q, correction_q):
-                break  # omit this correction, which is noise: it would move light bodies by much more than others
+                break  # leave out this correction: it is a rounding error, and may be large for light bodies
             return INNER_DIVERGED
         for j in range(q.size):
             q[j] += w.y[j]
@@ -239,14 +242,14 @@ def project_state(f, w, t, q, v, theta, a, lam):
     return code
 
 
-ROUNDING_OF_Q = 2e-14  # change of q that counts as rounding, relative to max|q|: about a hundred rounding errors
+ROUNDING_OF_Q = 2e-14  # a change of q by at most this fraction of max|q| counts as a rounding error
 
 
 @merged
 def _verify_pattern(w):
-    """Return DONE if w.pattern contains all nonzero entries of w.G; else write new programs that use the new entries.
+    """Return DONE if w.pattern is 1 for all nonzero entries of w.G; else write programs of elimination for all entries.
 
-    The code is then INNER_DIVERGED, so that the step is repeated with them; or SINGULAR if no program can be written.
+    Return INNER_DIVERGED after new programs, so that the caller repeats the step; SINGULAR if none can be written.
     """
     if not record_entries(w):
         return DONE
@@ -255,7 +258,7 @@ def _verify_pattern(w):
 
 @compiled
 def _do_task_between_evaluations(f, w, task, t, q, v):
-    """Do one of the tasks that choose, check or factor something between evaluations; return a code."""
+    """Do a task (see tasks.py) that chooses a partition, factors or checks something; return DONE or a failure code."""
     if task == tasks.FIND_NULL_SPACE:
         code = evaluate_and_factor_columns(f, w, t, q)
         if code == DONE:
@@ -274,12 +277,12 @@ def _do_task_between_evaluations(f, w, task, t, q, v):
 
 @kernel(INNER)
 def inner_loop(f, w, task, t, q, v, tolerance, a, lam):
-    """Do `task`, one of the numbers in tasks.py, at (t, q, v); return a code. Functions below explain the tasks."""
+    """Do a task (see tasks.py) at (t, q, v); return DONE or a failure code. Functions below explain the tasks."""
     if task >= tasks.FIND_NULL_SPACE:
         return _do_task_between_evaluations(f, w, task, t, q, v)
     if task in (tasks.EVALUATE, tasks.EVALUATE_WITHOUT_PROJECTION) and w.time_is_up == 1.0:
         return STOPPED
-    # methods that integrate all coordinates call the tasks EVALUATE_WITHOUT_PROJECTION and PROJECT
+    # the next two tasks are for methods that integrate all coordinates
     if task == tasks.EVALUATE_WITHOUT_PROJECTION:
         return compute_accelerations_at(f, w, t, q, v, a)
     if task == tasks.PROJECT:
@@ -304,31 +307,31 @@ def inner_loop(f, w, task, t, q, v, tolerance, a, lam):
 
 @merged
 def evaluate(f, w, t, q, v, tolerance, a):
-    """Compute the dependent entries of q and v from the independent ones, and the accelerations `a`; return a code.
+    """Compute dependent from independent entries of q and v, and the accelerations `a`; return DONE or a failure code.
 
-    Velocities and accelerations use the Jacobian that was factored last, at most w.reuse away from the final q.
+    Velocities and accelerations follow from the Jacobian that was factored last, at q or at most w.reuse from it.
     """
     return f.inner(f, w, tasks.EVALUATE, t, q, v, tolerance, a, w.lam)
 
 
 @merged
 def evaluate_state(f, w, t, q, v, tolerance, a, lam):
-    """Compute the dependent entries of q and v, the accelerations `a` and the multipliers lam; return a code.
+    """Compute dependent entries of q and v, accelerations `a` and multipliers lam; return DONE or a failure code.
 
-    Dependent entries are accurate up to rounding, as accepted states must be; for other states `evaluate` is faster.
+    Dependent entries are accurate up to rounding, as needed at ends of steps; for other states, `evaluate` is faster.
     """
     return f.inner(f, w, tasks.EVALUATE_STATE, t, q, v, tolerance, a, lam)
 
 
 @merged
 def evaluate_without_projection(f, w, t, q, v, a):
-    """Store in `a` the accelerations at (q, v), a state that may be off the constraints; return a code."""
+    """Store the accelerations at (q, v), which may violate the constraints, in `a`; return DONE or a failure code."""
     return f.inner(f, w, tasks.EVALUATE_WITHOUT_PROJECTION, t, q, v, 0.0, a, w.lam)
 
 
 @merged
 def project(f, w, t, q, v, theta, a, lam):
-    """Project (q, v) onto the constraints in place, and store `a` and lam; return a code. See `project_state`."""
+    """Project (q, v) onto the constraints in place, and store accelerations and multipliers, see `project_state`."""
     code = f.inner(f, w, tasks.PROJECT, t, q, v, theta, a, lam)
     if code == DONE and has_new_entries(w.G, w.pattern):
         code = f.inner(f, w, tasks.VERIFY_PATTERN, t, q, v, theta, a, lam)
@@ -337,61 +340,61 @@ def project(f, w, t, q, v, theta, a, lam):
 
 @merged
 def restore_constraints(f, w, t, q, v, tolerance):
-    """Compute the dependent entries of q and v from the independent ones, up to rounding; return a code."""
+    """Compute dependent from independent entries of q and v, up to rounding; return DONE or a failure code."""
     return f.inner(f, w, tasks.RESTORE, t, q, v, tolerance, w.x, w.lam)
 
 
 @merged
 def accelerations(f, w, t, q, v, a, lam):
-    """Store the accelerations `a` and multipliers lam at a state from `restore_constraints`; return a code."""
+    """Store accelerations `a` and multipliers lam after `restore_constraints`; return DONE or a failure code."""
     return f.inner(f, w, tasks.ACCELERATIONS, t, q, v, 0.0, a, lam)
 
 
 @merged
 def multipliers(f, w, t, q, v, a, lam):
-    """Store in lam the multipliers that belong to `a`, the accelerations of the last evaluation; return a code."""
+    """Store the multipliers lam that belong to `a`, the accelerations evaluated last; return DONE or a failure code."""
     return f.inner(f, w, tasks.MULTIPLIERS, t, q, v, 0.0, a, lam)
 
 
 @merged
 def find_tangents(f, w, t, q):
-    """Store the null space of G at q in w.D, and the rows and their factors in w; return a code."""
+    """Store the constraint Jacobian at q, its factors and its null space in w; return DONE or a failure code."""
     return f.inner(f, w, tasks.FIND_NULL_SPACE, t, q, q, 0.0, w.x, w.lam)
 
 
 @merged
 def prepare_mass(f, w, t, q):
-    """Store M(t, q) in w by the task for this, and the factors of M if the form uses them; return a code."""
+    """Store M(t, q) in w and, if the equations use them, its factors; return DONE or a failure code."""
     return f.inner(f, w, tasks.PREPARE_MASS, t, q, q, 0.0, w.x, w.lam)
 
 
 @merged
 def renew_partition(f, w, t, q):
-    """Choose a new partition at the position q of an accepted state, and store the sign of det C_qd; return a code."""
+    """Choose a partition at a consistent q, and store its sign of det C_qd in w; return DONE or a failure code."""
     return f.inner(f, w, tasks.RENEW_PARTITION, t, q, q, 0.0, w.x, w.lam)
 
 
 @merged
 def adopt_midpoint_partition(f, w, t_mid, state, new_state):
-    """Adopt the partition that pivoting chooses at the middle of a step, see partition.py; return a code."""
+    """Choose the partition for the middle of a step by `adopt_partition_of_midpoint` (partition.py); return its code."""
     return f.inner(f, w, tasks.ADOPT_MIDPOINT, t_mid, state, new_state, 0.0, w.x, w.lam)
 
 
 @merged
 def check_redundant_rows(f, w, t, q, v):
-    """Return DONE if the accepted state (q, v) satisfies the redundant rows, else ROWS_CONTRADICT."""
+    """Return DONE if the accepted state (q, v) also satisfies the redundant constraints, else ROWS_CONTRADICT."""
     return f.inner(f, w, tasks.CHECK_REDUNDANT, t, q, v, 0.0, w.x, w.lam)
 
 
 @merged
 def rounding_floor(q):
-    """Return the largest change by an iteration that rounding of q may cause; below it, the iteration has converged."""
+    """Return the largest change of q that may be a rounding error; after such a change, an iteration has converged."""
     return max(ROUNDING_OF_CORRECTIONS, ROUNDING_OF_Q * largest_of(q))
 
 
 @kernel(INNER)
 def generated_inner_loop(f, w, task, t, q, v, theta, a, lam):
-    """Do a task by the code generated for the mechanism or, if it fails, by the general inner loop; return a code."""
+    """Do a task by generated code or, if there is none or it fails, by `f.general`; return DONE or a failure code."""
     if task == tasks.EVALUATE_WITHOUT_PROJECTION:
         w.n_evaluations += 1
         w.n_factorizations += 1
@@ -422,7 +425,7 @@ def generated_inner_loop(f, w, task, t, q, v, theta, a, lam):
     elif task == tasks.CHECK_REDUNDANT and w.used_general == 0.0:
         if f.own_redundant(t, q, v, f.numbers, a):
             return DONE
-        f.general(f, w, tasks.FIND_NULL_SPACE, t, q, v, theta, a, lam)  # stores the rows at q in w
-    elif task <= tasks.MULTIPLIERS:  # tasks with a partition, for which there is no generated code
+        f.general(f, w, tasks.FIND_NULL_SPACE, t, q, v, theta, a, lam)  # stores G at q, which the check needs, in w
+    elif task <= tasks.MULTIPLIERS:  # these tasks use a partition, and there is no generated code for them
         w.used_general = 1.0
     return f.general(f, w, task, t, q, v, theta, a, lam)
