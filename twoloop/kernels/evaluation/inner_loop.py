@@ -92,7 +92,7 @@ def factor_mass_at(f, w, t, q):
 
 @merged
 def factor_equations_at(f, w, t, q):
-    """Factor the equations for accelerations, given the Jacobian w.G and null space w.D; return DONE or a failure code."""
+    """Factor the equations for accelerations, given Jacobian w.G and null space w.D; return DONE or a failure code."""
     if f.constant_mass == 0:
         w.factored = 0.0
         mass_matrix(f, w, t, q)
@@ -376,7 +376,7 @@ def renew_partition(f, w, t, q):
 
 @merged
 def adopt_midpoint_partition(f, w, t_mid, state, new_state):
-    """Choose the partition for the middle of a step by `adopt_partition_of_midpoint` (partition.py); return its code."""
+    """Choose the partition for the middle of a step by `adopt_partition_of_midpoint` and return its code."""
     return f.inner(f, w, tasks.ADOPT_MIDPOINT, t_mid, state, new_state, 0.0, w.x, w.lam)
 
 
