@@ -308,7 +308,7 @@ def estimate_errors(f, w, tolerance, tolerances, t, states, groups, z, coefficie
 
 @kernel(i8(KIT, WORK, VECTOR, MATRIX, MATRIX))
 def fill_accelerations(f, w, times, states, out):
-    """Store [a, lam] at consistent states [q, v] in the rows of `out`; return the number of failures, which are NaN."""
+    """Store [a, lam] at consistent states [q, v] in the rows of `out`; failures become NaN; return their number."""
     n = w.Q.size
     code = SINGULAR
     failures = 0

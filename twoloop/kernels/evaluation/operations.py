@@ -89,14 +89,14 @@ def _run_program(program, numbers, nodes, t, q, v):
 
 @exact
 def _result_indices(program):
-    """Return how many results there are, where they begin in `nodes`, and where their indices begin in `program`."""
+    """Return how many results there are, where they begin in `nodes`, and where their targets begin in `program`."""
     n = program[N_RESULTS]
     return n, program[N_NODES] - n, N_SIZES + N_COLUMNS * program[N_ROWS] + program[N_TERMS]
 
 
 @compiled
 def gamma_by_program(f, w, t, q, v):
-    """Store Gamma (of G a = Gamma) in w.Gamma by a traced program; return False without a program or finite values."""
+    """Store gamma in w.Gamma by a traced program; return False if no program exists, or a value is not finite."""
     program = f.gamma_program
     if program.size == 0:
         return False
@@ -111,7 +111,7 @@ def gamma_by_program(f, w, t, q, v):
 
 @compiled
 def jacobian_by_program(f, w, t, q, G):
-    """Store C_q in G (zero on entry) by a traced program; return False without a program or finite values."""
+    """Store C_q in G (zero on entry) by a traced program; return False if none exists, or a value is not finite."""
     program = f.jacobian_program
     if program.size == 0:
         return False

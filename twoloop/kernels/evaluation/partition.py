@@ -39,7 +39,7 @@ from twoloop.kernels.linalg.markowitz_lu import (
 RANK_TOLERANCE = 1e-11  # pivots count as zero up to this limit, if the largest entry of each row is 1
 PARTITION_CHANGED = -1  # return code: the task is done as for DONE, and a new partition was adopted
 MAX_ROWS_ELIMINATED = 200  # with more independent constraints, `min_pivot_ratio` does no elimination, to save time
-SENSITIVITY_GROWTH = 3.0  # a partition is poor once its sensitivity has grown by more than this factor
+SENSITIVITY_GROWTH = 3.0  # a partition is poor if the sensitivity of dependent coordinates has grown by this factor
 
 
 @compiled
@@ -108,10 +108,9 @@ def full_pivoting(A, order, row_order, row_maxima, first, last, max_rank):
 def min_pivot_ratio(f, w, t, q):
     """Return the ratio of the smallest to the largest pivot of [C_q; A] at (t, q), to detect singular positions.
 
-    A: rows of the non-holonomic constraints. The ratio is 0 if the rank is lower than before. The partition stays the
-    same. Rows are not scaled, because scaling would hide that a row has a small norm at a singular position. In the
-    fixed-order form, or with more than MAX_ROWS_ELIMINATED independent rows, return w.pivot, which was stored by the
-    last factorization (fixed-order form) or by the last choice of a partition.
+    A: rows of the non-holonomic constraints. The ratio is 0 if the rank is lower than before. Rows are not scaled,
+    because scaling would hide that a row has a small norm at a singular position. In the fixed-order form, return
+    w.pivot of the last factorization; with more than MAX_ROWS_ELIMINATED rows, w.pivot of the last partition.
     """
     if f.form == FIXED_ORDER or w.rows_v.size > MAX_ROWS_ELIMINATED:
         return w.pivot
@@ -186,7 +185,7 @@ def _copy_in_ascending_order(source, target):
 
 @compiled
 def _adopt_pivot_order(w):
-    """Store a new partition, and write the programs that factor its dependent columns of w.G, the constraint rows.
+    """Store a new partition, and write programs that factor its dependent columns of the Jacobian w.G.
 
     The first indices in w.row_order and w.order, those of the pivots, become independent rows and dependent
     coordinates. Return False if the dependent columns are singular.
@@ -207,7 +206,7 @@ def _adopt_pivot_order(w):
     if w.G_of_S.size > 0:
         w.G_of_S[0, 0] = np.nan
     if rank_v < w.Rate.size:
-        w.index_a[SIZE] = 0  # write a new program for the augmented matrix, which contains the independent rows
+        w.index_a[SIZE] = 0  # 0: the augmented matrix, which contains the independent rows, needs a new program
     return write_programs(w)
 
 
@@ -310,7 +309,7 @@ def _is_same_set(a, b):
 
 @compiled
 def choose_oriented_partition(f, w, t, q):
-    """Choose a partition at an accepted state; store sign(det C_qd) (0: unknown) in w.orientation; return a code."""
+    """Choose a partition; store sign(det C_qd) in w.orientation (C_qd: dependent columns of C_q); return a code."""
     code = choose_partition(f, w, t, q)
     w.orientation = 0.0
     if code != DONE:
@@ -373,9 +372,9 @@ ROUNDING_OF_CORRECTIONS = 1e-12  # corrections of positions up to this size, rel
 AMPLIFICATION = 1e3
 # constraint i holds up to rounding if |C_i| is at most this fraction of the largest |G_ij q_j| over j; G: Jacobian C_q
 ROUNDING_OF_ROWS = 2e-15
-MIN_CORRECTION = 10.0  # smallest tolerance of the corrections in a projection, in rounding errors of q (w.rounded)
-# a constraint is violated if |C_i| exceeds this fraction of max(1, |q_j|) times the largest entry of its Jacobian row,
-# or if |(C_q v + C_t)_i| exceeds this fraction of max(1, |v_j|) times this entry
+MIN_CORRECTION = 10.0  # smallest tolerance of corrections in a projection, in rounding errors of positions, w.rounded
+# constraint i is violated if |C_i| exceeds this fraction of max(1, max|q|) times the largest entry of its Jacobian row,
+# or if |(C_q v + C_t)_i| exceeds this fraction of max(1, max|v|) times this entry
 MAX_VIOLATION = 1e-7
 
 

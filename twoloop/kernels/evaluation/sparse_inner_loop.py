@@ -1,7 +1,7 @@
 """Do the tasks of the inner loop for large systems, by sparse factors in an order of elimination that is chosen once.
 
-There is no partition: steps integrate all coordinates, and the stages need not satisfy the constraints. Tasks that
-compute dependent coordinates in other forms move all coordinates to the nearest state on the constraints here, in the
+There is no partition: steps integrate all coordinates, and the stages need not satisfy the constraints. Where other
+forms compute dependent coordinates, this one moves all coordinates to the nearest state on the constraints, in the
 metric of M. If sparse factors do not show which rows are independent, a task returns NEEDS_DENSE, and the run continues
 with the forms of linalg/saddle_point.py, which methods with a partition always use. Callbacks may return the nonzero
 entries of C_q; then no array has n_c times n_q numbers. They may also fill dense matrices; then entries are copied.
@@ -65,12 +65,12 @@ from twoloop.kernels.linalg.symbolic_factorization import (
     pivot_order_of,
 )
 
-# limits of the squared sine of the angle between a row of G and previous rows: pivot / (squared norm of the row)
-SUSPECT_PIVOT = 1e-6  # up to this limit, the pivot may be a rounding error: check whether the row is redundant
-MIN_PIVOT = 1e-10  # factors are accurate if the squared sines of all independent rows exceed this
+# pivot / (squared norm of the row) is the squared sine of the angle between a row of C_q and previous rows
+SUSPECT_PIVOT = 1e-6  # up to this squared sine, the pivot may be a rounding error: check whether the row is redundant
+MIN_PIVOT = 1e-10  # factors are accurate if pivot / (squared norm of the row) exceeds this for all independent rows
 MAX_DEPENDENT_SINE = 1e-11  # a row is redundant if the sine of its angle to the independent rows is at most this
 PROJECT_STAGES = 2.0  # value of w.nearly_singular near a singular position, where stages must be projected
-# if the smallest squared sine of a row is at most the first limit, solutions are refined once; second limit: twice
+# if the smallest pivot / (squared norm of its row) is below the first limit, solutions are refined once; second: twice
 REFINE_ONCE_BELOW, REFINE_TWICE_BELOW = 1e-3, 1e-7
 
 
@@ -107,7 +107,7 @@ def fill_jacobian_values(f, w, t, q):
 
 @compiled
 def _factor_entries(f, w, min_sine_square):
-    """Factor [M G^T; G 0] from its entries in w; return the smallest squared sine of a row of G, see SUSPECT_PIVOT."""
+    """Factor [M G^T; G 0] from its entries in w; return the smallest sin^2 of the angle from a row to previous rows."""
     w.n_factorizations += 1
     stiffness = w.solutions[3 * f.ldl_program[N_PIVOTS] :]
     fill_saddle_matrix(f.ldl_program, w.mass_values, w.jacobian_values, w.factors, stiffness, w.pivot_sizes)
@@ -199,7 +199,7 @@ def _count_independent(is_independent):
 
 @compiled
 def _choose_rows(f, w, t, q):
-    """Set w.is_independent to 1 for rows of G that are independent, else 0; factor [M G^T; G 0] so; return a code.
+    """Set w.is_independent to 1 for independent rows of G, else to 0; factor [M G^T; G 0] with these; return a code.
 
     Rows with small pivots are left out at first, then added one by one if they are independent of the chosen rows.
     """
@@ -238,7 +238,7 @@ def _adopt_rows(w):
 
 @compiled
 def choose_rows(f, w, t, q):
-    """Choose and store the independent rows at (t, q); return a code: RANK_DIFFERS if w is too small or too large."""
+    """Choose and store independent rows at (t, q); return a code: RANK_DIFFERS if w has space for another number."""
     w.n_partitions += 1
     fill_mass_values(f, w, t, q)
     fill_jacobian_values(f, w, t, q)
@@ -253,11 +253,10 @@ def choose_rows(f, w, t, q):
     return _adopt_rows(w)
 
 
-# for multipliers lam of least norm with the reactions b = G^T lam, in the notation of the module docstring:
-REGULARIZATION = 1e-11  # diagonal entry j of W, relative to the sum of squares of column j of G
-CONVERGED_RESIDUAL = 1e-14  # the refinement ends if max|b - G^T lam| is at most this fraction of max|b|
-MAX_RESIDUAL = 1e-9  # if max|b - G^T lam| no longer decreases, lam is accepted up to this fraction of max|b|
-MAX_SOLUTIONS = 30  # largest number of refinements
+REGULARIZATION = 1e-11  # diagonal entry j of W (module docstring), relative to the sum of squares of column j of C_q
+CONVERGED_RESIDUAL = 1e-14  # multipliers are refined until reactions differ from the given ones by at most this part
+MAX_RESIDUAL = 1e-9  # if this difference no longer decreases, multipliers are accepted if it is at most this part
+MAX_SOLUTIONS = 30  # largest number of refinements of the multipliers of least norm
 
 
 @compiled
@@ -286,9 +285,10 @@ def _fill_least_norm_matrix(program, jacobian, n_q, weights, values):
 
 @compiled
 def _fill_residual(program, jacobian, force, x, r):
-    """Store the residual r = [b - G^T lam, lam - G x] of the unknowns x = [x, lam]; return max|b - G^T lam| / max|b|.
+    """Store the residual [b - G^T lam, lam - G x] in r; return max|b - G^T lam| / max|b|.
 
-    b: the argument `force`, the reactions that the multipliers lam must have; G: the Jacobian with entries `jacobian`.
+    The argument x contains [x, lam], the unknowns of `_fill_least_norm_matrix`. b: `force`, the reactions that the
+    multipliers lam must have; G: the Jacobian with the entries `jacobian`.
     """
     n_q, largest, residual = force.size, 0.0, 0.0
     copy(force, r[:n_q])
@@ -353,7 +353,7 @@ def _add_jacobian_times(f, w, x, out):
 
 @compiled
 def _fill_gamma(f, w, t, q, v):
-    """Store Gamma (of G a = Gamma) in w.Gamma; return NEEDS_DENSE if neither callback nor program can compute it."""
+    """Store gamma in w.Gamma; return DONE, or NEEDS_DENSE if neither a callback nor a traced program computes it."""
     w.Gamma[:] = 0.0
     if f.gamma_given == 1:
         f.gamma(t, q, v, f.p, w.Gamma)
@@ -461,7 +461,7 @@ def _project_state(f, w, t, q, v, theta):
         is_last = is_last or correction_q <= w.pivot * theta
         if not is_last and correction_q > CONTRACTION * last_correction:
             limit = ROUNDING_OF_CORRECTIONS * largest_of(q)
-            # do not apply this correction: it is noise, or due to divergence. Noise would move light bodies most
+            # do not apply this correction: if it is noise, it would move light bodies much more than heavy ones
             return (
                 DONE
                 if correction_q <= limit or (correction_q <= AMPLIFICATION * limit and _is_on_constraints(f, w, q))
@@ -514,7 +514,7 @@ def _do_task_between_evaluations(f, w, task, t, q, v, a, lam):
 
 @kernel(INNER)
 def sparse_inner_loop(f, w, task, t, q, v, tolerance, a, lam):
-    """Do `task` (see tasks.py) by sparse factors; return a code. For SOLVE, q and v are right-hand sides r and c."""
+    """Do `task` (see tasks.py) by sparse factors; return a code. For SOLVE, q and v are r and c of `_solve_system`."""
     if task in (tasks.EVALUATE, tasks.EVALUATE_WITHOUT_PROJECTION):
         code = STOPPED if w.time_is_up == 1.0 else DONE
         if code == DONE and task == tasks.EVALUATE and w.nearly_singular == PROJECT_STAGES:
@@ -535,5 +535,5 @@ def sparse_inner_loop(f, w, task, t, q, v, tolerance, a, lam):
     if code != DONE:
         return code
     code = _compute_multipliers(f, w, lam)
-    # w.M is empty, or nonzero only at the entries for which the program was written
+    # a dense form is needed if w.M has nonzero entries other than those for which the program was written
     return code if w.M.size == 0 or not has_new_entries(w.M, w.mass_pattern) else NEEDS_DENSE

@@ -98,7 +98,7 @@ def _write_final_states(work, control, n, n_rows, new, a, last, out_q, out_v, ou
 
 @compiled
 def _count_evaluations(settings, work, n_evaluations):
-    """In `n_evaluations` (n_runs), add to each running run the number of evaluations in its last step."""
+    """Add the number of evaluations in each lane's last step to `n_evaluations` (n_runs), at the index of its run."""
     for k in range(LANES):
         if work[at.RUNNING * LANES + k] == 1.0:
             n_within = settings[at.N_EVALUATIONS] + int(work[at.EVALUATED * LANES + k])

@@ -21,8 +21,7 @@ from twoloop.kernels.lanes.layout import (
     remove_run,
 )
 
-# indices in `options`, which contains the step-size rule (N_RULE numbers), these, and the method's options as in a run
-# outside the lanes (from N_HEAD on)
+# indices in `options`, after the step-size rule (N_RULE numbers). The options of the method in a single run follow
 # - JUMP_RATIO: largest ratio of true error to error estimate in a step in which a force jumps
 # - FIRST: first step size, relative to the shortest time scale at the start; LEAST: smallest tolerance of a coordinate
 JUMP_RATIO, FIRST, LEAST, N_HEAD = range(N_RULE, N_RULE + 4)
@@ -31,8 +30,8 @@ SUDDEN_ERROR = 10.0  # a rejected step with a larger error, in tolerances, is as
 MAX_RATIO_AFTER_REJECTION = 0.95  # largest ratio of the next step size to a rejected step size
 # if a step would end before t1 by at most this fraction of the time left, it is lengthened to end at t1
 END_ROUNDING = 1e-10
-# a failed step (its stages or its end cannot be computed) of size h limits step sizes to LIMIT_FACTOR h; the limit,
-# H_LIMIT, applies to this number of accepted steps. The values are those of `Plan`
+# if a step of size h fails because its stages or its end cannot be computed, step sizes are limited to LIMIT_FACTOR * h
+# until LIMIT_MEMORY steps have been accepted. The values are those of `Plan`
 LIMIT_FACTOR = 0.7
 LIMIT_MEMORY = 10.0
 LEAST_FIRST_STEP = 20.0 * at.SHORTEST  # lower bound of the first step size, relative to |t0|
@@ -169,10 +168,9 @@ def _accept_or_shorten(options, work, k):
 
 @compiled
 def judge_steps(options, work, n, a, start, status):
-    """Set ACCEPTED to 1 in lanes whose step succeeded with a small error; there, copy accelerations to `start`.
+    """Set ACCEPTED to 1 in lanes whose step succeeded with a small error; there, copy accelerations `a` to `start`.
 
-    In other lanes, count the rejected steps; after too many, remove the run. `a`, `start`: offsets of accelerations at
-    the end of this step, and at the beginning of the next one.
+    In other lanes, count the rejected steps; after too many, remove the run.
     """
     for k in range(LANES):
         work[at.ACCEPTED * LANES + k] = 0.0

@@ -75,9 +75,8 @@ CODE = Reference("LaneKit", {})  # numba's type for objects of the class LaneKit
 ALL_TASKS = (*TASKS, *TASKS_OF_STARTS, *TASKS_OF_STAGES, *TASKS_OF_EXPLICIT, *TASKS_OF_SERIES)
 CODE.add_llvm_functions(dict.fromkeys(ALL_TASKS, types.none(types.int64, VECTOR, VECTOR)))
 # signature of a method's step (code, settings, control, options, work, status, n_steps, within). In lanes with a run it
-# takes a step of size H, sets ACCEPTED, and stores the final state in NEW, accelerations in A, multipliers in LAM. If
-# `within`, it takes no step: where ACTIVE = 1, NEW becomes the state X s after the beginning of the last accepted step,
-# not projected
+# takes a step, sets ACCEPTED, and stores the final state in NEW, accelerations in A, multipliers in LAM. If `within`,
+# it takes no step: NEW becomes the state X s after the beginning of the last accepted step, not projected
 STEP = types.void(CODE, INTEGERS, *[VECTOR] * 3, *[INTEGERS] * 2, types.boolean)
 CODE.add_function("step", STEP)
 
@@ -179,7 +178,7 @@ def _add_product_in_four_lanes(work, t, p, q, sign):
 
 @compiled
 def add_product(work, target, x, y, sign):
-    """Add sign * x * y to the vector `target`; read four lanes before any of them is written, to allow SIMD code."""
+    """Add sign * x * y to `target`; read four lanes before writing one, to allow SIMD although vectors may overlap."""
     for k in range(0, LANES, 4):
         _add_product_in_four_lanes(work, target * LANES + k, x * LANES + k, y * LANES + k, sign)
 

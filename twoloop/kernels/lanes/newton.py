@@ -170,8 +170,7 @@ def compute_derivatives(code, settings, control, c, work):
 def factor_systems_of_lanes(settings, method_options, s, work):
     """Factor the matrices I - (X l)^2 J_q - X l J_v of Newton's method in each lane.
 
-    l: an eigenvalue of the tableau's matrix A, one of each complex pair; J_q and J_v: derivatives of the accelerations
-    by q and v; X: size of the step (s).
+    l: eigenvalue of the tableau's A (one of a complex pair); J_q, J_v: derivatives of a by q and v; X: step size (s).
     """
     n = settings[at.N]
     memory = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])[7]
@@ -231,7 +230,7 @@ def predict_stages(settings, c, work, begins):
 
 @compiled
 def _compute_residuals(code, settings, control, A, A2, c, work):
-    """Store the residuals F - a of the stage accelerations a in RESIDUAL; update SCALE_Q, SCALE_V; F: the equations."""
+    """Store in RESIDUAL accelerations by the equations minus those in STAGES; update ACTIVE, SCALE_Q and SCALE_V."""
     n, order = settings[at.N], settings[at.ORDER]
     _, new, _, _, a, _, _, memory = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])
     s = c.size
@@ -400,7 +399,7 @@ def _allowed_error(control, work, state, new, j, entry, k):
 
 @compiled
 def _store_embedded_estimate(settings, method_options, A, work, memory):
-    """Store the errors of q and v that the embedded formula estimates in E_Q and E_V, before filters."""
+    """Store in E_Q and E_V the errors of q and v that the embedded formula estimates, before filters."""
     n, s = settings[at.N], A.shape[0]
     offset = newton_options_index(s)
     gamma0, e = method_options[offset + GAMMA0], method_options[offset + N_EIGEN_SCALARS : offset + N_EIGEN_SCALARS + s]

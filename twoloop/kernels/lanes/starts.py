@@ -1,10 +1,9 @@
 """Project initial states in lanes onto the constraints by the least change; check whether another assembly is as near.
 
 G is the constraint Jacobian C_q with rows scaled to norm 1; the least change follows from the Cholesky factor of G G^T.
-If constraints are redundant, rows of G are dependent at positions that satisfy the constraints, and nearly dependent at
-others. Each row of Z contains the coefficients of a combination of rows of G that vanishes if the constraints hold, an
-eigenvector of G G^T. Components of right-hand sides along these are removed, and Z^T Z is added to G G^T, so that the
-sum is not singular. Lanes are independent.
+If constraints are redundant, rows of G are dependent where the constraints hold, and nearly dependent elsewhere. A row
+of Z, an eigenvector of G G^T, contains the coefficients of a combination of rows of G that vanishes. Components of
+right-hand sides along the rows of Z are removed, and Z^T Z is added to G G^T, so that the sum is not singular.
 
 `pattern` is the sparsity pattern of G. Its first n_rows + 1 entries are indices in `pattern`: the columns of row i are
 the entries from pattern[i] to pattern[i + 1] - 1. Matrices and vectors in `work` are given by offsets, in vectors.
@@ -20,11 +19,10 @@ from twoloop.kernels.data.common import INTEGERS, KIT, compiled, kernel, merged
 from twoloop.kernels.lanes import layout as at
 from twoloop.kernels.lanes.layout import CODE, LANES, copy_vectors, fill_field, offsets_in_work
 
-# G: constraint Jacobian with rows scaled to norm 1; Z: combinations of its rows that vanish, eigenvectors of G G^T
-DIAGONAL_SHIFT = 1e-15  # added to the diagonal of G G^T, so that the matrix is not singular
-ITERATION_SHIFT = 1e-8  # the same in inverse iterations for Z; larger, because eigenvalues of G G^T are zero then
-MAX_REDUNDANT_EIGENVALUE = 1e-4  # eigenvectors of G G^T with larger eigenvalues are not combinations that vanish
-N_REDUNDANT_ITERATIONS = 5  # inverse iterations for each row of Z; few suffice, because its eigenvalue is tiny
+DIAGONAL_SHIFT = 1e-15  # added to the diagonal of G G^T (G: Jacobian with rows of norm 1), which is not singular then
+ITERATION_SHIFT = 1e-8  # replaces DIAGONAL_SHIFT in inverse iterations, because some eigenvalues of G G^T are zero then
+MAX_REDUNDANT_EIGENVALUE = 1e-4  # up to this eigenvalue, an eigenvector of G G^T counts as a redundant constraint
+N_REDUNDANT_ITERATIONS = 5  # number of inverse iterations per redundant constraint; few suffice for tiny eigenvalues
 GOLDEN_SECTION = 0.6180339887498949  # inverse iterations start from irregular numbers: multiples of this one, modulo 1
 
 
@@ -74,8 +72,7 @@ def _multiply_vector(work, target, factor):
 def _cholesky(work, pattern, n_rows, n_redundant, row, factors, shift):
     """Store the Cholesky factor of G G^T + shift I + Z^T Z in each lane, with inverted diagonal entries.
 
-    G and Z are parts of `factors`, where the Cholesky factor is stored, too; see `factor_gram`. Z has n_redundant rows.
-    `row` (n) is scratch, with zeros on entry and on return.
+    G, Z and the result are parts of `factors`, see `factor_gram`. `row` (n) is scratch: zero on entry and on return.
     """
     n_entries = pattern[n_rows] - pattern[0]
     gram = factors + n_entries + n_rows
@@ -227,8 +224,7 @@ OTHER_GUESSES = ((-2.0, 0.0), (0.0, 1.0), (0.0, -1.0))
 def offsets_in_memory(memory, n, n_rows, n_entries, n_redundant):
     """Return the offsets (in vectors) of the arrays in the method's memory, which begins at `memory`, and of its end.
 
-    The memory begins with C and C_t (n_rows each) and the entries of G = C_q, which the generated code writes. Then
-    follow
+    It begins with C and C_t (n_rows each) and the entries of G = C_q, which the generated code writes. Then follow
 
     - x (n_rows), a right-hand side
     - change (n), of positions or velocities
@@ -352,7 +348,7 @@ def _project_velocities(code, settings, control, pattern, moves, work):
 
 @compiled
 def _find_weakest_direction(work, pattern, n, n_rows, n_redundant, factors, x, correction, weakest):
-    """Store the direction that constraints determine least in `weakest`; set RUNNING to 0 if they are dependent."""
+    """Store in `weakest` the direction that constraints determine least; set RUNNING to 0 where they are dependent."""
     scratch = factors + pattern[n_rows] - pattern[0] + n_rows * (1 + n_rows + n_redundant)
     for i in range(n_rows):
         fill_field(work, x + i, 0.5 + (GOLDEN_SECTION * (i + 1)) % 1.0)
@@ -371,10 +367,7 @@ def _find_weakest_direction(work, pattern, n, n_rows, n_redundant, factors, x, c
 
 @compiled
 def _check_nearby_guesses(code, settings, control, pattern, moves, work):
-    """Set RUNNING to 0 in lanes where another assembly may be as near to the guess.
-
-    This is so if the projection of one of OTHER_GUESSES fails, or differs much from its linear prediction.
-    """
+    """Set RUNNING to 0 where the projection of one of OTHER_GUESSES fails, or is far from its linear prediction."""
     n, n_rows, n_redundant = settings[at.N], settings[at.N_ROWS], settings[N_REDUNDANT]
     _, new, _, _, _, _, _, memory = offsets_in_work(n, n_rows, settings[at.N_NUMBERS])
     _, x, change, nearest, correction, weakest, displacement, _, factors, _, _ = _memory_offsets(

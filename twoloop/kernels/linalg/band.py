@@ -169,10 +169,7 @@ def _scratch_view(numbers, n, n_c, b):
 
 @compiled
 def factor_bordered(w, b, Cq, numbers, pivots, factorize, substitute):
-    """Factor the system [[B, Cq^T], [Cq, 0]], with the banded matrix B in `numbers`, in place; return DONE or SINGULAR.
-
-    `factorize`, `substitute`: indices of LAPACK routines, such as DGBTRF and DGBTRS.
-    """
+    """Factor [[B, Cq^T], [Cq, 0]], with banded B in `numbers`, by LAPACK, such as DGBTRF and DGBTRS; return a code."""
     n_c, n = Cq.shape
     band = lu_band(numbers, n, b)
     exchanges = pivots[: n - n_c].view(np.int32)
@@ -194,7 +191,7 @@ def factor_bordered(w, b, Cq, numbers, pivots, factorize, substitute):
 
 @compiled
 def solve_bordered(w, b, Cq, numbers, pivots, substitute, x):
-    """Replace x (n_q) by the x of [[B, Cq^T], [Cq, 0]] [x; mu] = [x; 0], using the factors from `factor_bordered`."""
+    """Replace r, the argument x, by x of [[B, Cq^T], [Cq, 0]] [x; mu] = [r; 0]; use factors from `factor_bordered`."""
     n_c, n = Cq.shape
     band, exchanges = lu_band(numbers, n, b), pivots[: n - n_c].view(np.int32)
     call_lapack(w.lapack[substitute], (NO_TRANSPOSE, n, b, b, 1, band, 3 * b + 1, exchanges, x, n))

@@ -95,25 +95,25 @@ def row_exchanges_of(index):
 
 @merged
 def index_of_upper_begins(r):
-    """Return where in `index` the list begins that says at which index in `values` each row of U begins."""
+    """Return the offset in `index` of the list that has the index in `values` of the first entry of each row of U."""
     return N_HEAD + 3 * r
 
 
 @merged
 def index_of_upper_ends(r):
-    """Return where in `index` the list begins that says at which index in `values` each row of U ends."""
+    """Return the offset in `index` of the list that has the index in `values` after the last entry of each row of U."""
     return N_HEAD + 4 * r
 
 
 @merged
 def index_of_lower_begins(r):
-    """Return where in `index` the list begins that says at which index in `values` each row of L begins."""
+    """Return the offset in `index` of the list that has the index in `values` of the first entry of each row of L."""
     return N_HEAD + 5 * r
 
 
 @merged
 def index_of_entries(r):
-    """Return where in `index` the row of each entry of the factors is listed; the columns and the sources follow."""
+    """Return the offset in `index` of the list of the row of each entry; the lists of columns and sources follow."""
     return N_HEAD + 6 * r + 1
 
 

@@ -246,7 +246,7 @@ def _add_rows_to_mass(mass, G, weak_ratio, scale, A, x, order, added):
     """Add scale * g g^T to the mass matrix M, for some rows g of G, until all its eigenvalues are large enough.
 
     An eigenvalue is too small if it is less than `weak_ratio` times the largest one. Rows are tried in the sequence of
-    the indices in `order`, where -1 replaces those of added rows. Store these in `added`; return their number, or
+    `order`, where -1 replaces the index of an added row. Store added indices in `added`; return their number, or
     STAYS_SINGULAR if no row removes a small eigenvalue.
     """
     n_added = 0
@@ -474,7 +474,7 @@ def choose_rows(original_mass, G, min_sine, weak_ratio, bounds, workspace, chose
     copy_matrix(original_mass, mass)
     n_added, scale = 0, 1.0
     if n_kept > 0 and weak_ratio > 0.0 and _count_weak_eigenvalues(mass, weak_ratio, A) > 0:
-        # the power of two that makes the largest entries of scale G^T G and M about equal
+        # the power of two for which the largest entries of scale * g g^T (g: a row of G) and M are about equal
         largest, largest_of_rows = largest_of(mass.reshape(mass.size)), largest_of(G.reshape(G.size))
         scale = 2.0 ** math.floor(math.log2(largest / (largest_of_rows * largest_of_rows)) + 0.5)
         _sort_rows_by_entries(G, order, sizes)
