@@ -351,7 +351,7 @@ def partition_is_poor(w):
     largest = 0.0
     for j in range(w.independent_v.size):
         largest = max(largest, largest_of(w.D[j]))
-    if w.sensitivity == 0.0:  # first check of a new partition
+    if w.sensitivity == 0.0:  # 0: not known, because this is the first check of a new partition
         w.sensitivity = max(largest, 1.0)
     if not largest <= SENSITIVITY_GROWTH * w.sensitivity:
         return True

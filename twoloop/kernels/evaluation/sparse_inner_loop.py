@@ -69,7 +69,7 @@ from twoloop.kernels.linalg.symbolic_factorization import (
 SUSPECT_PIVOT = 1e-6  # up to this squared sine, the pivot may be a rounding error: check whether the row is redundant
 MIN_PIVOT = 1e-10  # factors are accurate if pivot / (squared norm of the row) exceeds this for all independent rows
 MAX_DEPENDENT_SINE = 1e-11  # a row is redundant if the sine of its angle to the independent rows is at most this
-PROJECT_STAGES = 2.0  # value of w.nearly_singular near a singular position, where stages must be projected
+PROJECT_STAGES = 2.0  # value of w.nearly_singular that means: project stages onto the constraints before evaluations
 # if the smallest pivot / (squared norm of its row) is below the first limit, solutions are refined once; second: twice
 REFINE_ONCE_BELOW, REFINE_TWICE_BELOW = 1e-3, 1e-7
 
@@ -373,7 +373,7 @@ def _failure_of_accelerations(w, t, q):
 
 @compiled
 def _solve_system(f, w, r, c, a, lam):
-    """Solve M a + G^T lam = r and G a = c by the factors in w; store `a` and lam; return DONE."""
+    """Solve M a + G^T lam = r and G a = c (G: constraint Jacobian) by the factors in w; store `a`, lam; return DONE."""
     n = r.size
     copy(r, w.unknowns[:n])
     copy(c, w.unknowns[n:])
@@ -497,7 +497,7 @@ def _check_redundant_rows(f, w, t, q, v):
 
 @compiled
 def _do_task_between_evaluations(f, w, task, t, q, v, a, lam):
-    """Do a task other than evaluations and projections; return a code."""
+    """Do a task of tasks.py other than evaluations and projections; return a code (NEEDS_DENSE: unknown task)."""
     if task == tasks.FIND_NULL_SPACE:
         return factor_equations_at(f, w, t, q)
     if task == tasks.RENEW_PARTITION:

@@ -32,8 +32,8 @@ LANES = 8 if has_wide_vectors() else 4  # number of runs at once: the number of 
 # offsets in `work` of the fields, vectors with one number for each lane. The arrays of `array_offsets` follow, such as
 # STATE, the state at the beginning of the step, and NEW, the state at its end or within it
 (
-    T,  # time of STATE (s)
-    T_NEW,  # time of NEW (s)
+    T,  # time (s) of STATE, the state at the beginning of the step
+    T_NEW,  # time (s) of NEW, the state at the end of the step or within it
     UNIT,  # unit of time in which a Taylor series is computed (s)
     H,  # size of the step (s)
     X,  # time (s) from the beginning of the step to NEW; during tasks of a Taylor series, in units of UNIT
@@ -42,7 +42,7 @@ LANES = 8 if has_wide_vectors() else 4  # number of runs at once: the number of 
     PREDICTION_ERROR,  # difference of predicted and projected positions, relative to its limit, see step_size.py
     LENGTH,  # step size that the last terms of a Taylor series allow, in units of UNIT
     LONGEST,  # largest step size (s) that a Taylor method allows after the last step
-    REQUESTED,  # 1 in lanes that begin a run, or need a state within the step
+    REQUESTED,  # 1 in lanes that begin a run, or whose state at an output time within the step is computed
     WORST_DEFECT,  # largest defect within the step, relative to the allowed defect
     N_REJECTED,  # number of successive rejected steps
     RUNNING,  # 1 in lanes with a run
@@ -55,7 +55,7 @@ LANES = 8 if has_wide_vectors() else 4  # number of runs at once: the number of 
     ERROR,  # error estimate of the step, in units of the tolerances
     H_FULL,  # size (s) of the step before it was shortened to reach the end of the run
     H_NEXT,  # size of the next step (s)
-    H_LIMIT,  # upper limit of step sizes after a failed step (s); infinity: no limit
+    H_LIMIT,  # upper limit of step sizes (s), set by a failed step; infinity: no limit
     LIMIT_AGE,  # number of accepted steps since H_LIMIT was set
     JUMP_END,  # time (s) at the end of the last step that was rejected with an error above SUDDEN_ERROR
     SHIFT,  # number from 0 to 1 that shifts the times of evaluations of the defect within a step
@@ -71,7 +71,7 @@ TASKS_OF_SERIES = (
     *("compute_series", "choose_sizes", "check_defect_within"),
     *("evaluate_series", "evaluate_defect", "accept_or_reject"),
 )
-CODE = Reference("LaneKit", {})  # numba's type for objects of the class LaneKit
+CODE = Reference("LaneKit", {})  # type of objects of the class LaneKit in compiled code
 ALL_TASKS = (*TASKS, *TASKS_OF_STARTS, *TASKS_OF_STAGES, *TASKS_OF_EXPLICIT, *TASKS_OF_SERIES)
 CODE.add_llvm_functions(dict.fromkeys(ALL_TASKS, types.none(types.int64, VECTOR, VECTOR)))
 # signature of a method's step (code, settings, control, options, work, status, n_steps, within). In lanes with a run it
@@ -101,7 +101,7 @@ SHORTEST = 1e-13  # smallest step size, relative to max(|t|, |t1|); if a step is
 
 
 class LaneKit:
-    """Functions generated for a mechanism, and the step of a method, passed to kernels by reference (type `CODE`)."""
+    """Functions generated for a mechanism, and the step of a method; kernels receive this object by reference."""
 
     def __init__(self, own: GeneratedFunctions, step: Any = None):
         self.__dict__.update(dict.fromkeys(ALL_TASKS, 0))

@@ -45,8 +45,8 @@ from twoloop.kernels.steps.velocity_errors import LONGEST_GAPS, SLOW_FACTOR, STE
 
 # offsets of single vectors in the method's memory, before the blocks of vectors
 (
-    ITERATING,  # 1 in lanes whose iteration has not ended
-    DONE,  # 1 in lanes whose iteration has converged
+    ITERATING,  # 1 in lanes where Newton's iteration has not ended
+    DONE,  # 1 in lanes where Newton's iteration has converged
     CHANGE_BEFORE,  # largest correction by the previous iteration, relative to SCALE_Q and SCALE_V
     SCALE_Q,  # largest absolute position at the stages, at least 1
     SCALE_V,  # largest absolute velocity at the stages, at least 1
@@ -320,7 +320,7 @@ def _store_largest_corrections(settings, A, A2, work):
 
 @merged
 def _has_iteration_ended(options, work, memory, iteration, k):
-    """Set DONE to 1 if the iteration in lane k has converged, otherwise to 0; return whether the iteration ends."""
+    """Set DONE to 1 if Newton's iteration in lane k has converged, else to 0; return True if the iteration ends."""
     x, tolerance = work[at.X * LANES + k], options[N_HEAD + OUTER_TOL]
     rounding_limit = MAX_ROUNDING_CORRECTION * options[LEAST]
     change_v = x * work[(memory + LARGEST_V) * LANES + k] / work[(memory + SCALE_V) * LANES + k]
@@ -392,7 +392,7 @@ def store_state_from_stages(settings, b, bA, work):
 
 @merged
 def _allowed_error(control, work, state, new, j, entry, k):
-    """Return the allowed error, in lane k, of a state's entry with the index `entry`, which belongs to coordinate j."""
+    """Return atol + rtol * |value| for entry number `entry` of the state in lane k, which belongs to coordinate j."""
     magnitude = max(abs(work[(state + entry) * LANES + k]), abs(work[(new + entry) * LANES + k]))
     return control[at.ATOL + j] + control[at.RTOL] * magnitude
 
@@ -410,7 +410,7 @@ def _store_embedded_estimate(settings, method_options, A, work, memory):
         total += e[i]
     for i in range(n * LANES):
         work[e_q * LANES + i] = (gamma0 + total) * work[begin * LANES + i]
-    for j in range(s):  # the velocity at stage j changes by H sum_k A_jk a_k from the beginning of the step
+    for j in range(s):  # add e_j times the change of v from the beginning of the step to stage j, H sum_k A_jk a_k
         sum_rows(A[j], stage_rows, vector_range(work, sums, n))
         for i in range(n * LANES):
             work[e_q * LANES + i] += e[j] * work[at.H * LANES + i % LANES] * work[sums * LANES + i]

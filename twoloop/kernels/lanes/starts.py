@@ -143,7 +143,7 @@ def _find_redundant_combinations(work, pattern, n_rows, n_redundant, row, factor
             _remove_redundant_components(work, n_rows, w, Z, z, scratch)
         normalise_vector(work, z, n_rows, scratch)
         for k in range(LANES):
-            # the vector `scratch` now contains the eigenvalue plus ITERATION_SHIFT
+            # the vector `scratch` now contains the eigenvalue of G G^T plus ITERATION_SHIFT
             if not work[scratch * LANES + k] < MAX_REDUNDANT_EIGENVALUE:
                 work[z * LANES + k] = np.nan
 
@@ -214,7 +214,7 @@ ROUNDING_FACTOR = 64.0  # a constraint holds if its residual is at most this num
 # prediction (the displacement without its part normal to the constraints) by more than this part of the displacement
 MAX_CURVATURE = 0.25
 MIN_EIGENVALUE = 1e-12  # constraints are independent if all eigenvalues of G G^T exceed this (rows of G have norm 1)
-N_WEAKEST_ITERATIONS = 10  # number of inverse iterations for the weakest direction, see `offsets_in_memory`
+N_WEAKEST_ITERATIONS = 10  # number of inverse iterations for the direction that the constraints determine least
 N_REDUNDANT = 5  # index in `settings` of the number of redundant rows, in place of N_EVALUATIONS
 # factors (a, b) of three other guesses, p + a (p - p_0) + b d, where p_0 is the first guess, p its projection onto the
 # constraints, and d the direction that the constraints determine least
@@ -358,7 +358,7 @@ def _find_weakest_direction(work, pattern, n, n_rows, n_redundant, factors, x, c
     normalise_vector(work, x, n_rows, scratch)
     min_eigenvalue = MIN_EIGENVALUE if n_redundant == 0 else MAX_REDUNDANT_EIGENVALUE * n_rows
     for k in range(LANES):
-        if not work[scratch * LANES + k] > min_eigenvalue:  # `scratch` now contains the smallest eigenvalue
+        if not work[scratch * LANES + k] > min_eigenvalue:  # `scratch` contains the smallest eigenvalue of G G^T
             work[at.RUNNING * LANES + k] = 0.0
         factor = _largest_value(work, correction, n, k) / max(_largest_value(work, weakest, n, k), DIAGONAL_SHIFT)
         for j in range(n):

@@ -15,7 +15,7 @@ def copy(source, target):
 
 @merged
 def copy_matrix(source, target):
-    """Copy the matrix `source` to `target` row by row, up to the end of the smaller matrix."""
+    """Copy the matrix `source` to `target` row by row; if one has fewer rows, copy as many rows."""
     for i in range(min(source.shape[0], target.shape[0])):
         for j in range(source.shape[1]):
             target[i, j] = source[i, j]
@@ -169,7 +169,7 @@ def invert_definite(A):
 
 @merged
 def ldl_solve(A, x):
-    """Replace the right-hand side x by the solution, using the factors A from `ldl_factor`."""
+    """Replace the right-hand side x of a linear system by the solution, using the factors A from `ldl_factor`."""
     n = A.shape[0]
     for k in range(n):
         if x[k] != 0.0:

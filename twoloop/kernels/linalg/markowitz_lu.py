@@ -17,7 +17,7 @@ solution to column columns_of(index)[k].
 from twoloop.kernels.data.common import compiled, inlined, merged
 from twoloop.kernels.linalg.dense import copy, lu_factor, lu_sign, lu_solve
 
-MIN_PIVOT_RATIO = 0.1  # smallest pivot, relative to the largest entry in its column
+MIN_PIVOT_RATIO = 0.1  # smallest entry that may be a pivot, relative to the largest entry in its column
 MAX_SPARSE_RATIO = 0.5  # sparse factors are used if they need at most this share of the subtractions of dense factors
 MAX_SPARSE_ROWS = 3  # up to this number of rows, factors are sparse whatever the number of subtractions
 ZERO_PIVOT = 1e-11  # if a pivot is at most this fraction of the largest pivot before it, the matrix is singular
