@@ -19,7 +19,7 @@ from numpy.typing import NDArray
     ROWS_VIOLATED,  # constraints that counted as redundant are violated at the end of a step
     NEAR_SINGULAR,  # a singular position is near: the caller crosses it by special steps
     SWITCH_METHOD,  # the method does not suit the motion: the caller continues with another method
-    AT_DISCONTINUITY,  # C_t, or b in A v + b = 0, jumps at this time: the caller computes the state after the jump
+    AT_DISCONTINUITY,  # a constraint rate, C_t or b, jumps at this time: the caller computes the state after the jump
     NEEDS_DENSE,  # the fixed-order form cannot decide which rows are independent: the caller uses a dense form
     NEEDS_COMPILATION,  # the step has no machine code yet: the caller compiles it, then calls `advance` again
 ) = range(12)
@@ -42,28 +42,28 @@ H_BEFORE, ERROR_BEFORE, N_PAST = range(3)
     LIMIT_MEMORY,  # number of accepted steps after which clock[H_LIMIT] becomes LIMIT_START again
     MAX_STEPS,  # largest number of accepted steps
     STORE_ALL,  # 1: the states after all accepted steps are stored; 0: only states at output times
-    SYMMETRIC,  # 1: each step chooses a partition at its midpoint; 0: a partition is kept until `partition_is_poor`
+    SYMMETRIC,  # 1: each step chooses a partition at its midpoint; 0: it is kept until `partition_is_poor` is True
     MAX_ATTEMPTS,  # number of attempted steps after which `advance` returns; its caller then checks progress and time
     # 1: `advance` returns NEAR_SINGULAR near a singular position, so that the caller crosses it. 0: it never does so.
     # SUSPENDED: it does not do so near the present singular position; far from it, the value becomes 1 again
     MAY_CROSS,
-    SHORTEST,  # steps must be longer than this (s), and than EQUAL_SPACINGS spacings of floating-point numbers at t
-    MAY_SWITCH,  # 1: `advance` returns SWITCH_METHOD if a value is not finite, or if a step returns UNSUITED
+    SHORTEST,  # steps must be longer than this (s), and longer than 4 spacings of floating-point numbers at t
+    MAY_SWITCH,  # 1: `advance` returns SWITCH_METHOD if a value is not finite, or a step returns UNSUITED; 0: never
     # a method on trial is judged in this number of steps (-1: no trial): if the size of a next step is at most
     # tolerances[GAP], `advance` returns SWITCH_METHOD
     TRIAL_STEPS,
-    MAY_JUMP,  # 1: C_t, or b in A v + b = 0, may jump; 0: they are continuous in time
+    MAY_JUMP,  # 1: a constraint rate, C_t or b (in A v + b = 0), may jump; 0: constraint rates are continuous
     JUMP_RATIO,  # largest ratio of a step's true error to its error estimate if a force jumps within the step
     SPACING,  # time (s) between samples of the forces ahead of a step, see discontinuities.py; 0: no samples
     TIME_SPACING,  # longest time (s) between samples of the forces at a fixed state, see discontinuities.py
     # 1: forces may be sampled along the predicted motion; 0: never, because a callback raised an exception there
     SAMPLE_MOTION,
-    BY_TIME,  # 1: a force, C_t or b may change suddenly with time
-    BY_STATE,  # 1: a force may change suddenly with q or v; steps longer than SPACING then sample it along the motion
+    BY_TIME,  # 1: a force or a constraint rate (C_t, b) may change suddenly with time; 0: none does
+    BY_STATE,  # 1: a force may change suddenly with q or v: steps longer than SPACING sample the motion; 0: none does
     FIRST_GIVEN,  # 1: the user has chosen the first step size; 0: it is a guess, and may grow before a step is accepted
     MAX_EVALUATION_GAP,  # longest time in a step between two evaluations of the equations, relative to the step size
-    TAKES_MANY,  # 1: the method has a function `attempt_many`, which takes several steps without checks between them
-    CHECKS_WITHIN,  # 1: once a run has come near a singular position, pivots of C_q are checked within each step
+    TAKES_MANY,  # 1: the method has a function `attempt_many`, which takes steps without checks between them; 0: none
+    CHECKS_WITHIN,  # 1: after a run has come near a singular position, check pivots of C_q within each step; 0: never
     N_CONTROL,
 ) = range(N_RULE, N_RULE + 25)
 
@@ -85,19 +85,19 @@ H, ERRORS, FAILURES, PARTITIONS, JACOBIANS, N_STEP_COLUMNS = range(6)
     H_FAILED,  # size (s) of the step that failed last, or that caused the code ROWS_VIOLATED or SWITCH_METHOD
     H_LONG,  # longest recent step (s): after a step, the larger of its size and H_LONG_DECAY times the old H_LONG
     LARGEST_PIVOT,  # largest value so far of w.pivot, the smallest pivot in the elimination of C_q
-    JUMP_FROM,  # C_t or b jumps between this time (s) and JUMP_TO; infinite: no later jump is known
-    JUMP_TO,  # end (s) of the short interval with the next known jump of C_t or b
-    APPLIES_JUMP,  # 1: the next step leads from JUMP_FROM to JUMP_TO; `new_state` already contains the state at JUMP_TO
+    JUMP_FROM,  # a constraint rate (C_t, b) jumps between this time (s) and JUMP_TO; infinite: no later jump is known
+    JUMP_TO,  # end (s) of the short interval with the next known jump of a constraint rate (C_t, b)
+    APPLIES_JUMP,  # 1: the next step ends at JUMP_TO, in the state that `new_state` already contains; 0: ordinary step
     JUMP_END,  # end (s) of the last step rejected with a very large error: a force may jump before this time
     PIVOT_HERE,  # fixed-order form: smallest pivot, w.pivot, at the end of the last step
-    # samples of forces, C_t and b ahead of a step: at the fixed state where it begins, or along the predicted motion
+    # samples of forces and constraint rates ahead of a step: at the state where it begins, or along predicted motion
     SAMPLED_TO,  # time (s) of the last sample at a fixed state
     SAMPLED_EVERY,  # time (s) from one sample at a fixed state to the next, in the last set of samples
     WIDEST_SAMPLING,  # longest time (s) so far from one sample to the next
     DISCONTINUITY,  # time (s) of the next sudden change in samples at a fixed state; infinite: none is known
     DISCONTINUITY_OF_MOTION,  # time (s) of the next sudden change in samples along the motion; infinite: none is known
     COMPARED,  # beginning (s) of the last short step whose samples were compared with samples before and after the step
-    LAST_CHANGE,  # time (s) of the last sudden change of a force, C_t or b
+    LAST_CHANGE,  # time (s) of the last sudden change of a force or a constraint rate; -infinite: none
     SHORTEST_CHANGE,  # shortest time (s) from a sudden change to the next one so far; infinite: fewer than two changes
     MOTION_SAMPLED_TO,  # time (s) of the last sample along the motion
     SAMPLES_MOTION,  # 1 while callbacks are called at predicted states: exceptions there do not end the run; 0: else

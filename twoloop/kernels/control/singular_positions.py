@@ -92,7 +92,7 @@ def prepare_projected_repetition(f, w, control, clock, size):
 
 @merged
 def near_pivot_ratio(tolerances):
-    """Return the limit of pivot / LARGEST_PIVOT below which rounding may cause errors above MAX_ROUNDING_ERROR."""
+    """Return the ratio of pivot to LARGEST_PIVOT below which errors by rounding may exceed MAX_ROUNDING_ERROR."""
     return min(max(MIN_NEAR_RATIO, (EPS / (MAX_ROUNDING_ERROR * tolerances[LEAST])) ** (1.0 / 3.0)), MAX_NEAR_RATIO)
 
 
@@ -123,8 +123,8 @@ def comes_near_singular(f, w, control, clock, tolerances, t, size, state, new_st
     Rounding errors of its stages may exceed the tolerances. If control[MAY_CROSS] is SUSPENDED, return False and record
     the smallest pivot in clock[PIVOT_PASSED]. Far from singular positions, set control[MAY_CROSS] to 1.
     """
-    bridge = control[at.MAY_CROSS]
-    if bridge == 0.0 or control[at.CHECKS_WITHIN] == 0.0 or w.nearly_singular != 1.0 or control[at.FIXED_STEP] > 0.0:
+    may_cross = control[at.MAY_CROSS]
+    if may_cross == 0.0 or control[at.CHECKS_WITHIN] == 0.0 or w.nearly_singular != 1.0 or control[at.FIXED_STEP] > 0.0:
         return False
     if f.form == FIXED_ORDER or w.rows_v.size > MAX_ROWS_ELIMINATED:
         return False
@@ -136,7 +136,7 @@ def comes_near_singular(f, w, control, clock, tolerances, t, size, state, new_st
         control[at.MAY_CROSS] = 1.0
         return False
     least, change = _smallest_pivot_within_step(f, w, t, size, before, end, state, new_state)
-    if bridge == at.SUSPENDED:
+    if may_cross == at.SUSPENDED:
         min_ratio = max(least / largest, EPS)
         clock[at.PIVOT_PASSED] = min_ratio if clock[at.PIVOT_PASSED] == 0.0 else min(clock[at.PIVOT_PASSED], min_ratio)
         return False

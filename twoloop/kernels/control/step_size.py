@@ -65,7 +65,7 @@ def record_accepted_step(rule, past, h, error):
 
 @compiled
 def project_and_evaluate(f, w, t, Q, V, A):
-    """Project (Q, V), near the constraints, in place; store its accelerations in A; return DONE or a failure code."""
+    """Project the state (Q, V) onto the constraints; store its accelerations in A; return DONE or a failure code."""
     # in generated code, the task PROJECT is the cheapest; in the fixed-order form, the task EVALUATE does not project
     if (f.is_generated == 1 and w.Rate.size == w.C.size) or f.form == FIXED_ORDER:
         return f.inner(f, w, PROJECT, t, Q, V, INNER_TOL, A, w.lam)
@@ -86,7 +86,7 @@ def size_on_grid(clock, t, h, target, goal):
 
     The values are the size (s) of the step, the number of grid times that it reaches (0 or 1), and whether it reaches
     `goal`. Grid times are T_START + k h. `target`: next output time. If a grid time differs from `target` by at most
-    h / 10^6, both count as equal. `goal`: time of a jump of C_t or b before `target`, if there is one, else `target`.
+    h / 10^6, both count as equal. `goal`: `target`, or the time of a jump of a constraint rate before `target`.
     """
     rounding = EQUAL_SPACINGS * np.spacing(max(abs(t), abs(target)))
     margin = max(1e-6 * h, rounding)

@@ -99,7 +99,7 @@ N_OPTIONS = N_PAIR + 2 * N_OF_EACH
 (
     PHASE,  # EXPLICIT, ON_TRIAL, IMPLICIT or BACK_ON_TRIAL
     STEPS,  # number of accepted steps in this phase
-    MAY_ESTIMATE,  # 1: rho may be estimated, because the last attempted step was accepted
+    MAY_ESTIMATE,  # 1: rho may be estimated, because the last attempted step was accepted; 0: it was rejected
     NEXT_ESTIMATE,  # number of evaluations, counted from the start of the run, after which rho is estimated again
     ESTIMATES_TO_WAIT,  # number of estimates of rho that must still follow before the next trial may begin
     WAIT,  # value of ESTIMATES_TO_WAIT at the end of the last trial
@@ -158,7 +158,7 @@ def _history_view(memory):
 
 
 @inlined
-def _memory_views(memory, n):
+def _method_memories(memory, n):
     begin_second = N_SCALARS + 2 * n + int(memory[FIRST_MEMORY])
     return memory[N_SCALARS + 2 * n : begin_second], memory[begin_second:]
 
@@ -351,7 +351,7 @@ def _phase_to_begin(f, w, options, memory, tolerances, t, state, new_state):
 @kernel(COMMIT)
 def commit_switching(f, w, options, memory, tolerances, accepted):
     """Commit (if `accepted`) or discard the attempted step in the memory of the active method; count accepted steps."""
-    first, second = _memory_views(memory, w.Q.size)
+    first, second = _method_memories(memory, w.Q.size)
     begin = N_OPTIONS + int(options[SIZE_1])
     memory[MAY_ESTIMATE] = 0.0
     if _is_explicit(memory):
@@ -372,7 +372,7 @@ def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
     The memory of a method is set to zero when this method becomes active. Each method has its own step-size control.
     """
     n = w.Q.size
-    first, second = _memory_views(memory, n)
+    first, second = _method_memories(memory, n)
     if np.isnan(memory[T_BEGIN]):  # this is the first step of a run, or the first after a singular position
         memory[T_BEGIN], memory[COST_BEGIN] = t, _cost_of_run(w, options)
         memory[NEXT_ESTIMATE] = w.n_evaluations + FIRST_ESTIMATE * options[COST_RATIO]

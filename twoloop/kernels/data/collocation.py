@@ -24,7 +24,7 @@ CONVERGED, REJECTED, GUESSED, NOT_COMPUTED = range(4)
     TRIED,  # 1: the stored polynomial with the index 1 - CURRENT belongs to the attempted step; 0: it is not in use
     NEXT_DEGREE,  # degree of the polynomial that will predict the accelerations in the next step
     OLD_DEGREE,  # DEGREE before a step was rejected; the next accepted step restores it; 0: no rejected step
-    MAY_GUESS,  # 1: the step size is a guess; if the contraction RHO is not suitable, try another size; 0: it is final
+    MAY_GUESS,  # 1: the step size is a guess; if the contraction RHO is too small or large, try another; 0: final
     N_MASS_FIRST,  # number of next steps in which elimination begins with the mass matrix: another order has failed
     N_GUESSES,  # number of guesses of the first step size so far
     N_STEPS,  # number of accepted steps since the method began
@@ -48,7 +48,7 @@ CONVERGED, REJECTED, GUESSED, NOT_COMPUTED = range(4)
 # offsets of arrays that follow the single numbers
 POWERS = 32  # offset of eight numbers: powers 1 to 8 of H / H_BEFORE
 SCALED = 40  # offset of eight numbers: coefficients of the polynomial that predicts an acceleration, times POWERS
-MOVED = 48  # offset of eight numbers, one for each projected end of a step: largest change of a coordinate by a pass
+MOVED = 48  # offset of eight numbers, one for each projected end of a step: largest last correction of a coordinate
 VALID = 56  # offset of eight numbers, one for each projected end of a step: 1 if its projection is valid, else 0
 DEFECTS = 64  # offset of eight numbers: values of DEFECT in successive steps
 WEIGHTS = 72  # offset of n_q numbers: weights, 1 / (allowed error of the velocity) for each coordinate

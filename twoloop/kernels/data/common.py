@@ -56,9 +56,9 @@ class Work(NamedTuple):
     W: Any  # (r_v, n_q) G M^-1 (G: independent rows of the constraint Jacobian; M: mass matrix)
     A: Any  # (n_dof, n_dof) reduced mass matrix T^T M T (T: null space of G), then its factors; empty where S is used
     MT: Any  # (n_q, n_dof) mass matrix times T, whose columns are the null space of the constraint Jacobian
-    # null space of G: a row of -(G_d^-1 G_i)^T contains the dependent velocities, in the order of elimination, if one
-    # independent velocity is 1 and no drive moves; the last row of D, if all are 0 and drives move
-    D: Any  # (n_dof + 1, r_v)
+    # null space of G = [G_d G_i]: row j of -(G_d^-1 G_i)^T contains the dependent velocities, in order of elimination, if
+    # the independent velocity j is 1 and the others are 0. Last row of D: dependent velocities due to drives alone
+    D: Any  # (n_dof + 1, r_v) null space of the constraint Jacobian G; last row: velocities due to drives
     Gx: Any  # (n_c + n_a, n_q) constraint Jacobian at a displaced position; scratch for full pivoting
     G_of_S: Any  # (n_c + n_a, n_q) value of G for which S and W were computed, if M is constant; NaN: they are invalid
     pattern: Any  # (n_c + n_a, n_q) 1 for entries of the constraint Jacobian that have been nonzero in the run, else 0
@@ -66,7 +66,7 @@ class Work(NamedTuple):
     row_entries: Any  # for each row of G, the index of its list in this array; then the lists: columns of its entries
     Gamma_tried: Any  # (2, n_c + n_a) Gamma by differences with twice the time step e, and with the previous value of e
     rates: Any  # (13, n_c + n_a) constraint rates C_t and b at 13 times within a step, see discontinuities.py
-    changes: Any  # (N_CHANGES, n_q + n_c + n_a) samples of forces, C_t and b ahead of a step, see discontinuities.py
+    changes: Any  # (N_CHANGES, n_q + n_c + n_a) samples of forces and constraint rates, see discontinuities.py
     Q: Any  # (n_q) generalized forces
     x: Any  # (n_q) scratch, for example a displaced position
     y: Any  # (n_q) scratch, for example a correction of positions

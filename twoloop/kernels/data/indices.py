@@ -35,7 +35,7 @@ from twoloop.kernels.compile.callbacks import OPTIONAL_KINDS
     FIRST_GIVEN,  # index of the first flag of an optional callback, see GIVEN
 ) = range(7)
 MULTIPLIERS, NULL_SPACE, AUGMENTED, FIXED_ORDER = range(4)  # values of FORM: saddle_point.py, sparse_inner_loop.py
-# index in Functions.flags for the name of each optional callback; the flag is 1 if the user has given the callback
+# index in Functions.flags for the name of each optional callback; the flag is 1 if the callback is given, else 0
 GIVEN = {name: index for index, name in enumerate(OPTIONAL_KINDS, FIRST_GIVEN)}
 N_FLAGS = FIRST_GIVEN + len(GIVEN)
 FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN, REACTION_BY_Q_GIVEN, MASS_VALUES_GIVEN = (
@@ -58,7 +58,7 @@ FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN, REACTION_BY_Q_GIVEN, MASS_VALUES_GIVEN = (
 
 # indices in Work.notes: values that one kernel stores for another
 (
-    SENSITIVITY,  # largest derivative of a dependent by an independent coordinate when first checked, or 1; 0: not yet
+    SENSITIVITY,  # largest |dq_dependent / dq_independent| at this partition's first check, at least 1; 0: not checked
     ORIENTATION,  # sign of det C_qd (dependent columns) at the last accepted state with this partition; 0: not known
     ORIENTATION_NEW,  # sign of det C_qd (dependent columns of C_q) at the end of the attempted step; 0: not known
     FAULT_KIND,  # index in Functions of a callback that returned NaN or infinity; -1: none known
@@ -74,7 +74,7 @@ FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN, REACTION_BY_Q_GIVEN, MASS_VALUES_GIVEN = (
     RANK_V,  # rank of [C_q; A], stored together with RANK
     CONTRADICTION,  # with the code ROWS_CONTRADICT: index of a violated row of [C_q; A]
     PIVOT,  # smallest pivot of C_q, rows scaled to 1, at the last full pivoting; small near a singular position
-    # 1: the run has come near a singular position, or does not check; 2: near one, stages are projected; 0: else
+    # 1: the run has come near a singular position, or does not check for one; 2: near one, project stages; 0: else
     NEARLY_SINGULAR,
     NEAR_NOW,  # 1: a singular position was near at the last check; 2: the next check chooses a new partition; 0: else
     MASS_SCALE,  # factor by which M is multiplied in the augmented matrix, see linalg/saddle_point.py
@@ -86,12 +86,12 @@ FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN, REACTION_BY_Q_GIVEN, MASS_VALUES_GIVEN = (
     LARGEST_DEFECT,  # largest value of DEFECT in the accepted steps
     UNCHECKED,  # number of accepted steps without an evaluated defect
     WIDEST_GAP,  # longest time (s) between two evaluations of the equations within accepted steps
-    LAST_JUMP,  # time (s) of the last known jump of C_t or b; -infinite: none
-    NEXT_JUMP,  # time (s) of the next known jump of C_t or b, or the end of the run; infinite: neither is known
+    LAST_JUMP,  # time (s) of the last known jump of a constraint rate (C_t, b); -infinite: none
+    NEXT_JUMP,  # time (s) of the next known jump of a constraint rate (C_t, b), or end of the run; infinite: unknown
     # redundant rows are combinations of independent rows: largest |coefficient| at the last partition; 0: unknown
     MAX_COEFFICIENT,
     SMALLEST,  # fixed-order form: smallest sine^2 of an angle between rows of C_q; negative: M is not positive definite
-    TIME_IS_UP,  # 1: the time limit of the run has passed (set by another thread), and evaluations return STOPPED
+    TIME_IS_UP,  # 1 (set by another thread): the time limit has passed, and evaluations return STOPPED; 0: not yet
     N_NOTES,
 ) = range(33)
 

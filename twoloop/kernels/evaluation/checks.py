@@ -126,10 +126,10 @@ def linear_ranges(coordinates_in_units, radius, negligible, scratch, ranges):
 
 
 # flags that `evaluate_start` returns. WELL_FORMED: all values are finite, M is symmetric, no row of C_q or A is zero.
-# CONSISTENT: the state satisfies the constraints up to rounding. Eigenvalues of M are judged by a limit if M varies.
-# DEFINITE: all exceed limit * EIGENVALUE_MARGIN. INDEFINITE: one is below limit / EIGENVALUE_MARGIN
+# CONSISTENT: the state satisfies the constraints up to rounding. Only if M is not constant: DEFINITE if all eigenvalues
+# of M exceed their limit * EIGENVALUE_MARGIN, INDEFINITE if one is below the limit / EIGENVALUE_MARGIN
 WELL_FORMED, CONSISTENT, DEFINITE, INDEFINITE = 1, 2, 4, 8
-MAX_RELATIVE_DISTANCE = 0.5  # recorded sizes of coordinates are used at positions within this fraction of these sizes
+MAX_RELATIVE_DISTANCE = 0.5  # recorded sizes apply to q if each q_j moved by at most this fraction of its recorded size
 ROUNDING_OF_ZERO = 2.0**-52  # a coordinate up to this fraction of the largest one may be zero with a rounding error
 EIGENVALUE_MARGIN = 2.0  # if the least eigenvalue of M is within this factor of its limit, other checks must decide
 

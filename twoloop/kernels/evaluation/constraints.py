@@ -27,7 +27,7 @@ def constraint_rows(f, w, t, q, G):
 def clear_rows(f, w):
     """Set the constraint Jacobian w.G to zero; in the augmented form, set only the entries in w.row_entries to zero."""
     if f.form == AUGMENTED:
-        for i in range(w.Rate.size):
+        for i in range(w.Rate.size):  # the task VERIFY_PATTERN detects nonzero entries elsewhere
             for k in range(w.row_entries[i], w.row_entries[i + 1]):
                 w.G[i, w.row_entries[k]] = 0.0
     else:
@@ -73,7 +73,7 @@ def kinematics(f, w, t, q, v):
 
 @merged
 def gather_independent_columns(G, rate, rows, independent, D):
-    """Store in D a row -G[rows, j] for each independent column j, and last -rate[rows]: right-hand sides for G_d."""
+    """Store right-hand sides for the dependent columns of G in D: rows -G[rows, j] (j independent), then -rate[rows]."""
     for j in range(independent.size):
         column = independent[j]
         for k in range(rows.size):
@@ -116,7 +116,7 @@ def largest_difference_step(q, v):
 
 @merged
 def _difference_side(w, t, e):
-    """Return 1 (-1) if differences may only use times after (before) t, because C_t or b jumps within 2 e; else 0."""
+    """Return 1 (-1) if differences may only use times after (before) t, because C_t or b jumps within 2 e; 0: both."""
     since_jump, until_jump = t - w.last_jump, w.next_jump - t
     if min(since_jump, until_jump) >= 2.0 * e:
         return 0.0

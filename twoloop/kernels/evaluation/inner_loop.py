@@ -104,7 +104,7 @@ def factor_equations_at(f, w, t, q):
 
 @merged
 def compute_accelerations(f, w, t, q, v, a):
-    """Store the accelerations at (q, v) in `a`, given `_factor_rows_at` at q in w; return DONE or a failure code."""
+    """Store accelerations at (q, v) in `a`, after `_factor_rows_at` for the same q; return DONE or a failure code."""
     w.n_evaluations += 1
     code = factor_equations_at(f, w, t, q)
     if code == DONE:
@@ -135,7 +135,7 @@ def _record_gamma_scale(w, a):
 
 @merged
 def compute_multipliers(f, w, a, lam):
-    """Store the multipliers of all rows in lam: G^T lam = Q - M a; if rows are redundant, those of least norm."""
+    """Store the multipliers in lam, G^T lam = Q - M a (G: constraint Jacobian; least norm if rows are redundant)."""
     lam[:] = 0.0
     saddle_point.multipliers(f, w, w.Q, a, lam)
     if w.rows_v.size < lam.size:
@@ -199,7 +199,7 @@ def _find_corrections(f, w, v):
 def project_state(f, w, t, q, v, theta, a, lam):
     """Project (q, v) onto the constraints; store accelerations `a` and multipliers lam; return DONE or a failure code.
 
-    Rows of A constrain velocities only; positions are corrected in directions that these rows allow.
+    q and v change in place. Non-holonomic constraints act on velocities; positions are corrected as these allow.
 
     Passes end after one that corrects positions by at most theta, and velocities by at most theta max(1, max|v|). They
     also end after one that corrects positions by at most theta times w.pivot, the smallest pivot of C_q. Velocities are
