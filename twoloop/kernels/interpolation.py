@@ -220,7 +220,7 @@ def _state_difference(tolerances, scale_q, scale_v, states, i, q, v, q_other, v_
 
 @merged
 def _evaluate_accelerations(kind, h, s, z, c, size, z_v, c_v, size_v, a):
-    """Store the accelerations by the polynomials at t[i] + s h in `a`; for arguments see `_evaluate_polynomials`."""
+    """Store accelerations at t[i] + s h, derivatives of the polynomials, in `a`; see `_evaluate_polynomials`."""
     for m in range(a.size):
         value, slope, curvature = c[size - 1, m], 0.0, 0.0
         for r in range(size - 2, -1, -1):

@@ -163,7 +163,7 @@ def _find_pivot_order(w, max_rank, max_rank_v):
 
 @compiled
 def smallest_pivot(f, w, t, q):
-    """Return the smallest pivot of C_q at (t, q), with rows scaled to maxima of 1; return 0 if the rank is lower."""
+    """Return the smallest pivot of C_q at (t, q), with rows scaled to maxima of 1; 0 if the rank has become lower."""
     rank = w.rows.size
     if rank == 0:
         return 1.0
@@ -355,7 +355,7 @@ def partition_is_poor(w):
         w.sensitivity = max(largest, 1.0)
     if not largest <= SENSITIVITY_GROWTH * w.sensitivity:
         return True
-    # only redundant rows have coefficients; the fixed-order form (w.factors not empty) checks rows when it factors them
+    # without redundant rows, there is no coefficient; the fixed-order form (w.factors not empty) checks its rows itself
     if w.rows_v.size == w.Rate.size or w.factors.size > 0:
         return False
     coefficient = _largest_coefficient(w)

@@ -107,7 +107,10 @@ def fill_jacobian_values(f, w, t, q):
 
 @compiled
 def _factor_entries(f, w, min_sine_square):
-    """Factor [M G^T; G 0] from its entries in w; return the smallest sin^2 of the angle from a row to previous rows."""
+    """Factor [M G^T; G 0] from its entries in w; return the smallest sin^2 of the angle of a row of G to previous rows.
+
+    Rows with a sin^2 up to `min_sine_square` become redundant, and do not count. If M is not definite, return -1.
+    """
     w.n_factorizations += 1
     stiffness = w.solutions[3 * f.ldl_program[N_PIVOTS] :]
     fill_saddle_matrix(f.ldl_program, w.mass_values, w.jacobian_values, w.factors, stiffness, w.pivot_sizes)
@@ -287,8 +290,7 @@ def _fill_least_norm_matrix(program, jacobian, n_q, weights, values):
 def _fill_residual(program, jacobian, force, x, r):
     """Store the residual [b - G^T lam, lam - G x] in r; return max|b - G^T lam| / max|b|.
 
-    The argument x contains [x, lam], the unknowns of `_fill_least_norm_matrix`. b: `force`, the reactions that the
-    multipliers lam must have; G: the Jacobian with the entries `jacobian`.
+    The argument x contains [x, lam]. b: `force`, reactions that the multipliers lam must have; G: Jacobian `jacobian`.
     """
     n_q, largest, residual = force.size, 0.0, 0.0
     copy(force, r[:n_q])

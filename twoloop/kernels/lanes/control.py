@@ -82,7 +82,7 @@ def begin_control(options, control, work, n, state, a, start):
 def choose_steps(work, control, status, n_steps):
     """Store the size of the next step, at most control[GAP] (s), in H and X; remove runs whose steps are too short.
 
-    In lanes without a run, H, X and ACTIVE become 0; ACTIVE becomes 1 in the others. Runs with MAX_STEPS steps end.
+    Runs with MAX_STEPS steps are removed, too. In lanes without a run, H, X and ACTIVE become 0; else ACTIVE becomes 1.
     """
     t1 = control[at.T1]
     for k in range(LANES):

@@ -72,7 +72,7 @@ from twoloop.kernels.steps.velocity_errors import LONGEST_GAPS, SLOW_FACTOR, STE
     UNFILTERED,  # estimated error of v before filters
     FILTERED_ONCE,  # estimated error of v after one filter
     COMPLEX,  # scratch: real part of the right-hand side and solution of a linear system
-    _IMAGINARY,  # imaginary part of the same
+    _IMAGINARY,  # scratch: imaginary part of the right-hand side and solution of a linear system
     N_VECTORS,
 ) = range(15)
 # indices of blocks (s, n), for s stages: accelerations at the stages of this step; the same for the previous step;
@@ -392,7 +392,7 @@ def store_state_from_stages(settings, b, bA, work):
 
 @merged
 def _allowed_error(control, work, state, new, j, entry, k):
-    """Return atol + rtol * |value| for entry number `entry` of the state in lane k, which belongs to coordinate j."""
+    """Return atol + rtol * max(|before|, |after| the step) for an entry of the state that belongs to coordinate j."""
     magnitude = max(abs(work[(state + entry) * LANES + k]), abs(work[(new + entry) * LANES + k]))
     return control[at.ATOL + j] + control[at.RTOL] * magnitude
 

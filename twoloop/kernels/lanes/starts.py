@@ -28,7 +28,7 @@ GOLDEN_SECTION = 0.6180339887498949  # inverse iterations start from irregular n
 
 @merged
 def _subtract_in_four_lanes(work, target, x, x_stride, y, y_stride, count):
-    """Subtract products work[x] * work[y], with strides of x and y, from work[target]; also in the next three lanes."""
+    """Subtract `count` products work[x] * work[y], with strides of x and y, from work[target]; treat four lanes so."""
     t0, t1, t2, t3 = work[target], work[target + 1], work[target + 2], work[target + 3]
     for _ in range(count):
         t0 -= work[x] * work[y]

@@ -51,8 +51,8 @@ ORDER_CHOSEN, SINGULAR_MATRIX, TOO_MANY_ENTRIES = range(3)  # codes of `choose_o
     ROW_SIZE,  # number of entries in the list of a row
     COLUMN_SIZE,  # number of entries in the list of a column, without eliminated rows
     ACTIVE_ROW_SIZE,  # number of entries of a row in columns that are not eliminated yet
-    ROW_POSITION,  # position of a row in the order so far
-    COLUMN_POSITION,  # position of a column in the order so far
+    ROW_POSITION,  # position of a row in the order of elimination that has been chosen so far
+    COLUMN_POSITION,  # position of a column in the order of elimination that has been chosen so far
     LOOKUP,  # scratch
     N_COUNTS,
 ) = range(7)
