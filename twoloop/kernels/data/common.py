@@ -56,8 +56,8 @@ class Work(NamedTuple):
     W: Any  # (r_v, n_q) G M^-1 (G: independent rows of the constraint Jacobian; M: mass matrix)
     A: Any  # (n_dof, n_dof) reduced mass matrix T^T M T (T: null space of G), then its factors; empty where S is used
     MT: Any  # (n_q, n_dof) mass matrix times T, whose columns are the null space of the constraint Jacobian
-    # null space of G = [G_d G_i]: row j of -(G_d^-1 G_i)^T contains the dependent velocities, in order of elimination, if
-    # the independent velocity j is 1 and the others are 0. Last row of D: dependent velocities due to drives alone
+    # null space of G = [G_d G_i]: row j of -(G_d^-1 G_i)^T contains the dependent velocities (in order of elimination)
+    # for independent velocity j = 1 and the others 0. The last row of D contains the dependent velocities due to drives
     D: Any  # (n_dof + 1, r_v) null space of the constraint Jacobian G; last row: velocities due to drives
     Gx: Any  # (n_c + n_a, n_q) constraint Jacobian at a displaced position; scratch for full pivoting
     G_of_S: Any  # (n_c + n_a, n_q) value of G for which S and W were computed, if M is constant; NaN: they are invalid

@@ -73,7 +73,7 @@ def kinematics(f, w, t, q, v):
 
 @merged
 def gather_independent_columns(G, rate, rows, independent, D):
-    """Store right-hand sides for the dependent columns of G in D: rows -G[rows, j] (j independent), then -rate[rows]."""
+    """Store right-hand sides for the dependent columns of G in D: rows -G[rows, j] (independent j), and -rate[rows]."""
     for j in range(independent.size):
         column = independent[j]
         for k in range(rows.size):
