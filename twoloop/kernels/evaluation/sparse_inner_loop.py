@@ -499,7 +499,7 @@ def _check_redundant_rows(f, w, t, q, v):
 
 @compiled
 def _do_task_between_evaluations(f, w, task, t, q, v, a, lam):
-    """Do a task of tasks.py other than evaluations and projections; return a code (NEEDS_DENSE: unknown task)."""
+    """Do a task other than evaluations and projections; return a code (NEEDS_DENSE: only dense forms can do it)."""
     if task == tasks.FIND_NULL_SPACE:
         return factor_equations_at(f, w, t, q)
     if task == tasks.RENEW_PARTITION:

@@ -54,7 +54,7 @@ from twoloop.kernels.steps.velocity_errors import LONGEST_GAPS, SLOW_FACTOR, STE
     LARGEST_V,  # largest correction of a stage's velocity by this iteration, divided by the step size
     H_PREVIOUS,  # size (s) of the step whose accelerations are in PREVIOUS; 0: there is no such step
     CONSTANT,  # 1: the predicted accelerations of all stages equal the accelerations at the beginning; else 0
-    DURATION,  # time (s) for which a velocity error keeps its sign, see velocity_errors.py; 0: not known
+    DURATION,  # time (s) until a velocity error changes its sign or decays, see velocity_errors.py; 0: not known
     N_SINGLE_VECTORS,
 ) = range(11)
 # indices of blocks of n vectors in the method's memory (n: number of coordinates)

@@ -141,7 +141,7 @@ def clear_lists(index, r):
 
 @compiled
 def put_entry(matrix, i, j, number, source):
-    """Add entry (i, j) = `number` to the lists, with `source`, the index of its value; return False if one is full."""
+    """Add entry (i, j) = `number` to the lists (`source`: index of its initial value); return False if one is full."""
     counts, lists, numbers = matrix
     n, m = counts[ROW_SIZE, i], counts[COLUMN_SIZE, j]
     if n == numbers.shape[1] or m == numbers.shape[1]:

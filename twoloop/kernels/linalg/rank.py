@@ -132,7 +132,7 @@ def express_other_rows(rows, order, min_sine, chosen_rows, basis, factors, kept,
 def singular_values_exceed(rows, ratio, gram):
     """Return True if all singular values of a matrix A = `rows` certainly exceed `ratio` times the largest one, s.
 
-    This is so if A A^T - (ratio s)^2 I is definite; the Frobenius norm (at least s) replaces s. `gram` is scratch.
+    This is so if A A^T - (ratio s)^2 I is positive definite; the Frobenius norm (>= s) replaces s. `gram` is scratch.
     """
     n, total = len(rows), 0.0
     for i in range(n):
