@@ -29,8 +29,8 @@ class FixedOrderSizes(NamedTuple):
     dense_jacobian: bool  # True: the entries of C_q are copied from a full matrix, which a callback fills
 
 
-# arguments of _create_layout: numbers of coordinates, of rows of C_q, of rows of A (non-holonomic); ranks of C_q and
-# of [C_q; A]; True if accelerations follow from T^T M T (T: null space of the constraints); True if they follow from the
+# arguments of _create_layout: numbers of coordinates, of rows of C_q, of rows of A (non-holonomic); ranks of C_q and of
+# [C_q; A]; True if accelerations follow from T^T M T (T: null space of the constraints); True if they follow from the
 # augmented matrix; number of nodes of traced programs; FixedOrderSizes or None; length of the array `matrices`
 Sizes = tuple[int, int, int, int, int, bool, bool, int, FixedOrderSizes | None, int]
 ArrayRanges = list[tuple[str, int, int, tuple[int, ...]]]  # for each array: name, first offset, end, shape
