@@ -96,7 +96,7 @@ H, ERRORS, FAILURES, PARTITIONS, JACOBIANS, N_STEP_COLUMNS = range(6)
     WIDEST_SAMPLING,  # longest time (s) so far from one sample to the next
     DISCONTINUITY,  # time (s) of the next sudden change in samples at a fixed state; infinite: none is known
     DISCONTINUITY_OF_MOTION,  # time (s) of the next sudden change in samples along the motion; infinite: none is known
-    COMPARED,  # beginning (s) of the last short step whose samples were compared with samples before and after the step
+    COMPARED,  # beginning (s) of the last short step whose force samples were compared with samples before and after it
     LAST_CHANGE,  # time (s) of the last sudden change of a force or a constraint rate; -infinite: none
     SHORTEST_CHANGE,  # shortest time (s) from a sudden change to the next one so far; infinite: fewer than two changes
     MOTION_SAMPLED_TO,  # time (s) of the last sample along the motion

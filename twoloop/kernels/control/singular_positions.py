@@ -75,9 +75,9 @@ def is_too_short_near_singular(f, clock, size):
 def prepare_projected_repetition(f, w, control, clock, size):
     """Return True if a rejected step of the fixed-order form must be repeated with its stages projected.
 
-    Then also set the flag for this projection, and the new size clock[H_NEXT]. Near a singular position, stages that
-    violate the constraints have inaccurate accelerations. A long step that ends well beyond the position may succeed
-    where shorter steps fail, so the first repetition is at least as long as clock[H_LONG], the longest recent step.
+    Then also set w.nearly_singular, which causes the projection, and clock[H_NEXT]. Near a singular position, stages
+    that violate the constraints have inaccurate accelerations. A long step that ends well beyond the position may
+    succeed where shorter steps fail, so the first repetition is at least as long as clock[H_LONG], a recent long step.
     """
     is_near = clock[at.PIVOT_HERE] < REPEAT_PIVOT * clock[at.LARGEST_PIVOT]
     if f.form != FIXED_ORDER or control[at.FIXED_STEP] > 0.0 or w.nearly_singular == 1.0 or not is_near:
@@ -92,7 +92,7 @@ def prepare_projected_repetition(f, w, control, clock, size):
 
 @merged
 def near_pivot_ratio(tolerances):
-    """Return the ratio of pivot to LARGEST_PIVOT below which errors by rounding may exceed MAX_ROUNDING_ERROR."""
+    """Return the ratio of smallest pivot to LARGEST_PIVOT below which rounding may exceed MAX_ROUNDING_ERROR."""
     return min(max(MIN_NEAR_RATIO, (EPS / (MAX_ROUNDING_ERROR * tolerances[LEAST])) ** (1.0 / 3.0)), MAX_NEAR_RATIO)
 
 

@@ -50,36 +50,36 @@ from twoloop.kernels.data.indices import DONE, ESTIMATE, FIXED_ORDER, GAP, MAX_G
 from twoloop.kernels.evaluation.inner_loop import renew_partition
 from twoloop.kernels.linalg.dense import copy
 
-# rho is first estimated after FIRST_ESTIMATE evaluations, then every BETWEEN_ESTIMATES evaluations. Both numbers are
-# multiplied by options[COST_RATIO] while the explicit method is active. An estimate takes about eight evaluations
+# the largest rate is first estimated after FIRST_ESTIMATE evaluations, then every BETWEEN_ESTIMATES evaluations. An
+# estimate takes about eight. While the explicit method is active, both numbers are multiplied by options[COST_RATIO]
 FIRST_ESTIMATE, BETWEEN_ESTIMATES = 100.0, 600.0
-N_POWER_ITERATIONS = 4  # number of power iterations with dF/dq in an estimate of rho; largest number with dF/dv
+N_POWER_ITERATIONS = 4  # number of power iterations by dF/dq per estimate (F: accelerations); largest number by dF/dv
 NEGLIGIBLE_DAMPING = 1e-3  # power iterations with dF/dv end early if the eigenvalue times the step size is below this
 ZERO_REPLACEMENT = 1e-3  # replaces zero components of the vector of a power iteration, whose largest component is 1
-STABILITY_LIMIT = 3.0  # if h rho exceeds this multiple of options[LIMIT], a trial begins even if it is expensive
-# if Jacobians are computed by finite differences (about eight evaluations per coordinate), a trial also waits until the
-# run has cost this number of evaluations per independent coordinate, unless h rho exceeds STABILITY_LIMIT
+STABILITY_LIMIT = 3.0  # if step size * rho exceeds this multiple of the stability limit, a trial begins at any cost
+# if Jacobians are computed by finite differences (about eight evaluations per coordinate), a trial that STABILITY_LIMIT
+# does not require also waits until the run has cost this number of evaluations per independent coordinate
 MIN_COST_PER_COORDINATE = 64.0
 TRIAL_COST = 300.0  # approximate cost of a trial of the implicit method, in evaluations of the implicit method
-# unless h rho exceeds STABILITY_LIMIT, a trial waits until the run has cost as much as this number of trials
+# a trial that STABILITY_LIMIT does not require waits until the run has cost as much as this number of trials
 MIN_COST_IN_TRIALS = 3.0
 COUNTED_FRACTION_OF_RUN = 0.3  # the cost so far counts as at least this fraction of the expected cost of the whole run
-# after the run has cost this multiple of MIN_COST_IN_TRIALS trials, a trial begins at any value of rho. After k trials,
-# the next one begins at k + 1 times this cost
+# after the run has cost this multiple of MIN_COST_IN_TRIALS trials, a trial begins, whatever the largest rate rho is.
+# After k trials, the next one begins at k + 1 times this cost
 COST_OF_ANY_TRIAL = 100.0
-MIN_RATIO_TO_MOTION = 30.0  # rho is "hidden" (not seen in the motion) if it exceeds this multiple of `_motion_rate`
+MIN_RATIO_TO_MOTION = 30.0  # rho is "hidden" (the motion does not show it) above this multiple of `_motion_rate`
 QUIET_FACTOR = 10.0  # vibrations count as small if their velocities are at most this number of tolerances
-# if rho is hidden, or its vibrations are small, a trial begins if h rho exceeds this multiple of options[LIMIT]
+# if rho is hidden, or has small vibrations, a trial begins at step size * rho above this part of the stability limit
 MIN_HIDDEN_RATIO = 0.05
 DIFFERENCE_STEP = 1e-4  # time step of the finite difference in `_motion_rate`, relative to 1 / rho
-RETURN_BELOW = 0.4  # the explicit method is tried again if h rho is below this multiple of options[LIMIT]
+RETURN_BELOW = 0.4  # the explicit method is tried again at step size * rho below this part of the stability limit
 # errors of the implicit method on trial are multiplied by this factor, so that it cannot win by making larger errors
 TRIAL_ERROR_FACTOR = 10.0
 MEAN_WEIGHT = 0.8  # after a step: new mean step size = MEAN_WEIGHT * old mean + (1 - MEAN_WEIGHT) * size of the step
 N_UNMEASURED_STEPS = 5.0  # number of accepted steps at the beginning of a trial that do not count in its cost
 N_MEASURED_STEPS = 10.0  # number of accepted steps over which the cost of the method on trial is measured
-MIN_GAIN = 1.2  # a trial succeeds if a second of motion costs less than before by at least this factor
-N_ESTIMATES_AFTER_SUCCESS = 4.0  # number of estimates of rho from a successful trial to the next trial
+MIN_GAIN = 1.2  # a trial succeeds if it divides the cost of a second of motion by at least this factor
+N_ESTIMATES_AFTER_SUCCESS = 4.0  # number of estimates of the largest rate from a successful trial to the next trial
 
 # values of memory[PHASE]. EXPLICIT, IMPLICIT: this method is in use. ON_TRIAL: the implicit method is on trial.
 # BACK_ON_TRIAL: the explicit method is on trial, after the implicit method was in use
@@ -87,7 +87,7 @@ EXPLICIT, ON_TRIAL, IMPLICIT, BACK_ON_TRIAL = range(4)
 
 # `options` contains N_PAIR options of the pair (indices below); N_OF_EACH numbers for each method, namely parameters of
 # step-size control (loop_state.py) and, at REUSE_OF, w.reuse; and the options of the first and the second method.
-# - LIMIT, N_ESTIMATES: the implicit method is tried after h rho has exceeded LIMIT in N_ESTIMATES estimates
+# - LIMIT: stability limit of step size * rho; after N_ESTIMATES estimates above LIMIT, the implicit method is tried
 # - MATRIX_COST: cost of a Jacobian, in evaluations of accelerations
 # - COST_RATIO: cost of an evaluation by the second (implicit) method, in evaluations by the first (explicit) one
 # - SIZE_1: number of options of the first method
@@ -99,14 +99,14 @@ N_OPTIONS = N_PAIR + 2 * N_OF_EACH
 (
     PHASE,  # EXPLICIT, ON_TRIAL, IMPLICIT or BACK_ON_TRIAL
     STEPS,  # number of accepted steps in this phase
-    MAY_ESTIMATE,  # 1: rho may be estimated, because the last attempted step was accepted; 0: it was rejected
-    NEXT_ESTIMATE,  # number of evaluations, counted from the start of the run, after which rho is estimated again
-    ESTIMATES_TO_WAIT,  # number of estimates of rho that must still follow before the next trial may begin
+    MAY_ESTIMATE,  # 1: the largest rate may be estimated, as the last attempted step was accepted; 0: it was rejected
+    NEXT_ESTIMATE,  # number of evaluations since the start of the run after which the largest rate is estimated again
+    ESTIMATES_TO_WAIT,  # number of estimates of the largest rate that must still follow before the next trial may begin
     WAIT,  # value of ESTIMATES_TO_WAIT at the end of the last trial
     T_BEGIN,  # time (s) at which the measurement of the cost per second began; NaN: it begins with the next step
     COST_BEGIN,  # cost of the run up to the time T_BEGIN, in evaluations
     COST_PER_SECOND,  # cost of a second of motion before the last trial, in evaluations by the explicit method
-    RATE,  # last estimate of rho (1/s)
+    RATE,  # last estimate of rho, the largest rate of the motion (1/s)
     FIRST_MEMORY,  # length of the memory of the first method
     H_MEAN,  # weighted mean of the last step sizes (s), see MEAN_WEIGHT
     HISTORY,  # first of two entries with the history of step-size control (see loop_state.py) in this phase
@@ -114,7 +114,7 @@ N_OPTIONS = N_PAIR + 2 * N_OF_EACH
     H_TRIED,  # size of the last attempted step (s)
     ERROR_TRIED,  # error of the last attempted step, in tolerances
     N_TRIALS,  # number of trials so far
-    N_ABOVE_LIMIT,  # number of estimates with h rho > LIMIT; a smaller h rho sets it to 0, unless trials cost too much
+    N_ABOVE_LIMIT,  # number of estimates of h * rate above LIMIT; one below sets it to 0 unless trials cost too much
     N_SCALARS,
 ) = range(19)
 
@@ -212,7 +212,7 @@ def _largest_rate(f, w, memory, t, state, new_state):
         growth_by_v = _power_iteration(f, w, t, state, by_v, True, Q, V, A)
         if growth_by_v * memory[H_MEAN] < NEGLIGIBLE_DAMPING:
             break
-    for m in range(n):  # a zero component could remain zero in later estimates, even if rho then belongs to it
+    for m in range(n):  # a zero component could remain zero in later estimates, and hide its motion from them
         if by_q[m] == 0.0:
             by_q[m] = ZERO_REPLACEMENT
         if by_v[m] == 0.0:
@@ -303,7 +303,7 @@ def _judge_trial(w, options, memory, t):
 
 @compiled
 def _phase_to_begin(f, w, options, memory, tolerances, t, state, new_state):
-    """Estimate rho, and decide whether a trial of the other method begins; return its phase, or -1 if none begins."""
+    """Estimate the largest rate; if a trial of the other method must begin, return its phase (PHASE), else -1."""
     n = w.Q.size
     memory[RATE] = _largest_rate(f, w, memory, t, state, new_state)
     cost_per_second, cost = _cost_per_second(w, options, memory, t), _cost_of_run(w, options)
@@ -315,8 +315,8 @@ def _phase_to_begin(f, w, options, memory, tolerances, t, state, new_state):
         memory[N_ABOVE_LIMIT] += 1.0
     if memory[ESTIMATES_TO_WAIT] > 0.0:
         return -1
-    # unless h rho exceeds STABILITY_LIMIT, a trial begins only if it is cheap compared with `counted`: the cost of the
-    # run so far or, if larger, a fraction of the expected cost of the whole run
+    # unless `h_rho` exceeds STABILITY_LIMIT, a trial begins only if it is cheap compared with `counted`: the cost of
+    # the run so far or, if larger, a fraction of the expected cost of the whole run
     counted, min_cost = cost, MIN_COST_IN_TRIALS * TRIAL_COST * options[COST_RATIO]
     if np.isfinite(tolerances[GAP]):
         counted = max(counted, COUNTED_FRACTION_OF_RUN * tolerances[GAP] / MAX_GAP_RATIO * cost_per_second)

@@ -91,7 +91,7 @@ NEGLIGIBLE_DISAGREEMENT = 1e-11
 # weights of values at the times 0, e, 2 e and 4 e in one-sided differences of order 2; COARSE: with the step 2 e
 ONE_SIDED_WEIGHTS, ONE_SIDED_WEIGHTS_COARSE = (-1.5, 2.0, -0.5, 0.0), (-0.75, 0.0, 1.0, -0.25)
 ONE_SIDED_STEP_RATIO = 1.0 / 16.0  # ratio of the time step of one-sided differences to that of central differences
-# if terms of G v cancel, the rounding error of Gamma is about this multiple of (largest |term| / largest time step)
+# if terms of G v cancel (G: Jacobian), the rounding error of Gamma is this times (largest |term| / largest time step)
 ROUNDING_OF_TERMS = 1e-14
 CONVERGED_CHANGE = 0.01  # the search for a time step ends if Gamma changes by at most this part of its allowed error
 

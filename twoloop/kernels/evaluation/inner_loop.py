@@ -331,7 +331,7 @@ def evaluate_without_projection(f, w, t, q, v, a):
 
 @merged
 def project(f, w, t, q, v, theta, a, lam):
-    """Project (q, v) onto the constraints in place, and store accelerations and multipliers, see `project_state`."""
+    """Project (q, v) onto the constraints in place as described in `project_state`; return DONE or a failure code."""
     code = f.inner(f, w, tasks.PROJECT, t, q, v, theta, a, lam)
     if code == DONE and has_new_entries(w.G, w.pattern):
         code = f.inner(f, w, tasks.VERIFY_PATTERN, t, q, v, theta, a, lam)
@@ -394,7 +394,7 @@ def rounding_floor(q):
 
 @kernel(INNER)
 def generated_inner_loop(f, w, task, t, q, v, theta, a, lam):
-    """Do a task by generated code or, if there is none or it fails, by `f.general`; return DONE or a failure code."""
+    """Do a task by generated code or, if none succeeds, by the general inner loop; return DONE or a failure code."""
     if task == tasks.EVALUATE_WITHOUT_PROJECTION:
         w.n_evaluations += 1
         w.n_factorizations += 1
