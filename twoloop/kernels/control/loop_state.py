@@ -47,7 +47,7 @@ H_BEFORE, ERROR_BEFORE, N_PAST = range(3)
     # 1: `advance` returns NEAR_SINGULAR near a singular position, so that the caller crosses it. 0: it never does so.
     # SUSPENDED: it does not do so near the present singular position; far from it, the value becomes 1 again
     MAY_CROSS,
-    SHORTEST,  # steps must be longer than this (s), and longer than 4 spacings of floating-point numbers at t
+    SHORTEST,  # steps must be longer than this (s), and longer than EQUAL_SPACINGS spacings of floating-point times
     MAY_SWITCH,  # 1: `advance` returns SWITCH_METHOD if a value is not finite, or a step returns UNSUITED; 0: never
     # a method on trial is judged in this number of steps (-1: no trial): if the size of a next step is at most
     # tolerances[GAP], `advance` returns SWITCH_METHOD

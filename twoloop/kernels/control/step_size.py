@@ -130,7 +130,7 @@ def count_step(w, tolerances, control, clock, size, out_step):
     gap = size
     if w.defect >= 0.0:
         gap = min(size, tolerances[DEFECT_GAP])
-    elif is_beyond_gap(tolerances, size):  # only methods with many stages may take steps longer than GAP
+    elif is_beyond_gap(tolerances, size):  # (only methods that evaluate often within a step exceed GAP)
         gap = control[at.MAX_EVALUATION_GAP] * size
     w.widest_gap = max(w.widest_gap, gap)
     clock[at.H_LONG] = max(size, H_LONG_DECAY * clock[at.H_LONG])

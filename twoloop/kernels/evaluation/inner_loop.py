@@ -125,7 +125,7 @@ def compute_accelerations(f, w, t, q, v, a):
 
 @compiled
 def _record_gamma_scale(w, a):
-    """Raise w.gamma_scale, the size to which errors of Gamma are compared, to the largest sum over j of |G_ij a_j|."""
+    """Raise w.gamma_scale, the size of Gamma, to the largest sum over j of |G_ij a_j| (G: constraint Jacobian)."""
     for i in range(w.Rate.size):
         total = 0.0
         for p in range(w.row_entries[i], w.row_entries[i + 1]):
