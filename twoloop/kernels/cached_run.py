@@ -252,16 +252,6 @@ def _has_consistent_rows(w, b, n):
 
 
 @merged
-def _evaluate_start(checked_kit, b, t, q, v, records, shifts):
-    """Evaluate all callbacks at the start (t, q, v); store M, C_q etc. in `b`. For the result see `evaluate_start`."""
-    for k in range(b.start_values.size):
-        b.start_values[k] = 0.0
-    return b.evaluate_start(
-        checked_kit, t, q, v, records, b.lam, b.room, b.mass, b.rows, shifts, b.pattern, b.roundings
-    )
-
-
-@merged
 def _start_run(f, checked_kit, w, b, t, t1, q, v, records, checks):
     """Prepare a run from t to t1 with the setup of the last run; return 0, or REFUSED, IN_DOUBT or UNCHOSEN.
 
@@ -272,7 +262,12 @@ def _start_run(f, checked_kit, w, b, t, t1, q, v, records, checks):
     if not (finite_vector(q) and finite_vector(v)):
         return REFUSED
     has_all_entries = b.constants[HAS_ALL_ENTRIES] > 0.0
-    flags = _evaluate_start(checked_kit, b, t, q, v, records, b.shifts[: 0 if has_all_entries else len(b.shifts)])
+    shifts = b.shifts[: 0 if has_all_entries else len(b.shifts)]
+    for k in range(b.start_values.size):
+        b.start_values[k] = 0.0
+    flags = b.evaluate_start(
+        checked_kit, t, q, v, records, b.lam, b.room, b.mass, b.rows, shifts, b.pattern, b.roundings
+    )
     if has_all_entries:
         pattern = b.pattern.reshape(b.pattern.size)
         for k in range(b.kinds.size):  # kind 0: the entry of the constraint rows is always zero

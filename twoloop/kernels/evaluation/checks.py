@@ -247,19 +247,6 @@ def _record_entries(rows, pattern):
 
 
 @exact
-def _record_entries_at_displacements(f, t, q, shifts, position, rows, n_c, pattern):
-    """Set `pattern` to 1 where [C_q; A] is nonzero at a position q + max|q| shifts[k]; `position`, `rows`: scratch."""
-    largest = largest_of(q)
-    for k in range(len(shifts)):
-        for j in range(q.size):
-            position[j] = q[j] + max(abs(q[j]), largest) * shifts[k, j]
-        _set_to_zero(rows)
-        f.jacobian(t, position, f.p, rows[:n_c])
-        f.nonholonomic(t, position, f.p, rows[n_c:])
-        _record_entries(rows, pattern)
-
-
-@exact
 def _is_definite(mass, min_eigenvalue, factors):
     """Return whether all eigenvalues of M exceed `min_eigenvalue` times max|M_ij|; `factors` is scratch."""
     n, largest = len(mass), 0.0
@@ -336,9 +323,14 @@ def evaluate_start(f, t, q, v, records, lam, results, mass, rows, shifts, patter
             result_flags |= INDEFINITE
     _record_entries(rows, pattern)
     rows_nearby = results[end : end + n_rows * n].reshape((n_rows, n))
-    _record_entries_at_displacements(
-        f, t, q, shifts, results[end + n_rows * n : end + n_rows * n + n], rows_nearby, n_c, pattern
-    )
+    position, largest = results[end + n_rows * n : end + n_rows * n + n], largest_of(q)
+    for k in range(len(shifts)):
+        for j in range(n):
+            position[j] = q[j] + max(abs(q[j]), largest) * shifts[k, j]
+        _set_to_zero(rows_nearby)
+        f.jacobian(t, position, f.p, rows_nearby[:n_c])
+        f.nonholonomic(t, position, f.p, rows_nearby[n_c:])
+        _record_entries(rows_nearby, pattern)
     return result_flags
 
 

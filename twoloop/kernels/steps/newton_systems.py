@@ -479,18 +479,6 @@ def _solve_and_keep_independents(w, b, numbers, pivots, substitute, x):
 
 
 @compiled
-def _solve_banded_system(f, w, b, numbers, pivots, substitute, X, x):
-    """Replace the right-hand side x[:n_dof] by the solution of Newton's system, by factors of the bordered matrix.
-
-    The other entries of x (n_q), and X (n_q), are scratch.
-    """
-    _multiply_by_T(w, b, x, X)
-    x[:] = 0.0
-    add_banded_mass_times(f, w, X, x)
-    _solve_and_keep_independents(w, b, numbers, pivots, substitute, x)
-
-
-@compiled
 def _filter_error_banded(f, w, options, memory, s, h, e_q, e_v):
     """Filter e_v[:n_dof] as `filter_error` does, by the banded factors; the other entries of e_v (n_q) are scratch."""
     n = w.Q.size
@@ -777,7 +765,10 @@ def _solve_system(f, w, memory, s, index, numbers, substitute, X, x):
     """Replace x[:n_dof] by the solution of Newton's system, by factors from `_factor_system`; X (n_q) is scratch."""
     m, pivots = w.independent.size, pivots_of(memory, s, w.Q.size, index)
     if f.bandwidth >= 0:
-        _solve_banded_system(f, w, f.bandwidth, numbers, pivots, substitute, X, x)
+        _multiply_by_T(w, f.bandwidth, x, X)
+        x[:] = 0.0
+        add_banded_mass_times(f, w, X, x)
+        _solve_and_keep_independents(w, f.bandwidth, numbers, pivots, substitute, x)
     else:
         lu_solve(as_matrix(numbers, m), pivots, x[:m])
 
