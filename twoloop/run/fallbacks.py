@@ -96,14 +96,27 @@ def scaled_equations(system: ConstrainedSystem, t: float, q: Array) -> tuple[Arr
 # before the position or too near it; smaller sizes, if the error is too large or a node is at the position
 SIZE_RATIOS = (1.0, *(1.2**k for k in range(1, 12)), *(0.85**k for k in range(1, 28)))
 LARGEST_RATIO = max(SIZE_RATIOS)
+# a run that began beside a singular position has taken short steps only: its first steps, of together less than
+# FIRST_STEPS times the longest of the last steps, show no suitable size, and much larger sizes are tried, too
+FIRST_STEPS = 30.0
+LARGE_RATIOS = tuple(1.2**k for k in range(12, 30))
 # "distance" of a state from a singular position: smallest pivot of C_q, relative to the largest such pivot of the run.
 # The base, the state at which the polynomial across the position begins, should have at least the distance FAR_BEFORE
 FAR_BEFORE = 0.2
-# limits on steps across a singular position, each looser than the one before. STRICT: the limits of the run. WIDER:
-# evaluations may be GAP_FACTOR times as far apart (any distance if no force can be short). NEARER: steps may also end
-# before the position. LOOSER: tolerances are also multiplied by TOLERANCE_FACTOR
+# evaluations may be GAP_FACTOR times as far apart as usual, or arbitrarily far if no force can be short
 TOLERANCE_FACTOR, GAP_FACTOR = 10.0, 4.0
-LIMITS = STRICT, WIDER, NEARER, LOOSER = tuple(range(4))
+NODE_DISTANCES = 1.0, 0.5, 0.25  # values of Limits.node_distance that are tried in turn
+
+
+class Limits(NamedTuple):
+    """Limits of steps across a singular position. If all attempts fail, wider limits are tried."""
+
+    has_wide_gaps: bool  # whether the limit of the time between evaluations is multiplied by GAP_FACTOR
+    may_approach: bool  # whether steps may end before the position
+    tolerance_factor: float  # factor on the tolerances
+    # factor on the distance from the position below which nodes are left out. Nearer nodes have larger rounding errors,
+    # which the error estimate shows; but if a motion is slow near the position, few nodes are farther
+    node_distance: float
 
 
 class Origin(NamedTuple):
@@ -111,7 +124,7 @@ class Origin(NamedTuple):
 
     earliest: float  # no node of the polynomial is before this time (s)
     base: TimedState | None  # earlier state at which the polynomial begins; None: it begins at the current state
-    limits: int  # STRICT, WIDER, NEARER or LOOSER
+    limits: Limits
     may_end_beyond: bool = False  # whether the polynomial may end beyond the end of the run
 
 
@@ -168,7 +181,7 @@ def cross_singularity(run: Run, past: list[TimedState]) -> tuple[Plan, Array]:
     # try several origins, because one may fail: its nodes may lie before a jump of a force; near the start or the end
     # of the run, there may be too few nodes; a polynomial from an old base may be too long
     h_long, compiled = float(clock[a.H_LONG]), not run.system.called_in_python
-    near_start = compiled and clock[a.T] - clock[a.T_START] < h_long
+    near_start = compiled and _is_near_start(run)
     near_end = compiled and clock[a.T] + LARGEST_RATIO * h_long > run.t1
     origins = [(earliest, base), *[(earliest, None)] * (base is not None), *[(-np.inf, None)] * bool(near_start)]
     origins.append((np.inf, None))
@@ -189,11 +202,20 @@ def cross_singularity(run: Run, past: list[TimedState]) -> tuple[Plan, Array]:
     return plan, control
 
 
-def _limits(run: Run) -> tuple[int, ...]:
+def _limits(run: Run) -> list[Limits]:
     """Return the limits of steps across a singular position to try, in this order."""
     if run.control[run.a.FIXED_STEP] > 0.0:
-        return (STRICT,)
-    return LIMITS if any(run.short_forces) or run.forces_may_be_steep else LIMITS[WIDER:]
+        return [Limits(False, True, 1.0, 1.0)]
+    choices = [(False, False, 1.0), (True, False, 1.0), (True, True, 1.0), (True, True, TOLERANCE_FACTOR)]
+    if not (any(run.short_forces) or run.forces_may_be_steep):
+        choices.pop(0)
+    return [Limits(*choice, distance) for choice in choices for distance in NODE_DISTANCES]
+
+
+def _is_near_start(run: Run) -> bool:
+    """Return whether the run has only taken its first steps, whose sizes show little."""
+    a, clock = run.a, run.clock
+    return bool(clock[a.T] - clock[a.T_START] < FIRST_STEPS * clock[a.H_LONG])
 
 
 def _prepare_next_origin(run: Run, plan: Plan, control: Array) -> None:
@@ -202,15 +224,12 @@ def _prepare_next_origin(run: Run, plan: Plan, control: Array) -> None:
 
     a, clock = run.a, run.clock
     earliest, base, limits, beyond = run.origins.pop(0)
-    may_approach = limits in (NEARER, LOOSER) or control[a.FIXED_STEP] > 0.0
-    begin_polynomial(plan.memory, clock[a.LARGEST_PIVOT], earliest, may_approach, base)
-    run.crossing_tolerances = run.tolerances
-    if limits != STRICT:
-        run.crossing_tolerances = run.tolerances.copy()
+    begin_polynomial(plan.memory, clock[a.LARGEST_PIVOT], earliest, limits.may_approach, limits.node_distance, base)
+    run.crossing_tolerances = run.tolerances.copy()
+    if limits.has_wide_gaps:
         run.crossing_tolerances[indices.GAP] *= GAP_FACTOR if any(run.short_forces) else np.inf
-    if limits == LOOSER:
-        run.crossing_tolerances[[indices.RTOL, indices.LEAST]] *= TOLERANCE_FACTOR
-        run.crossing_tolerances[indices.ATOL :] *= TOLERANCE_FACTOR
+    run.crossing_tolerances[[indices.RTOL, indices.LEAST]] *= limits.tolerance_factor
+    run.crossing_tolerances[indices.ATOL :] *= limits.tolerance_factor
     if control[a.FIXED_STEP] == 0.0:
         control[a.MAX_STEP] = min(run.max_step, run.crossing_tolerances[indices.GAP] / control[a.MAX_EVALUATION_GAP])
     h_long, max_size, time_left = float(clock[a.H_LONG]), float(control[a.MAX_STEP]), run.t1 - float(clock[a.T])
@@ -218,7 +237,7 @@ def _prepare_next_origin(run: Run, plan: Plan, control: Array) -> None:
     if not beyond and control[a.FIXED_STEP] == 0.0:
         max_size = min(max_size, time_left)
     first_size = max(h_long, run.mirrored_size)
-    sizes = sizes_across(first_size, max_size)
+    sizes = sizes_across(first_size, max_size, _is_near_start(run))
     run.sizes_to_try = [size for size in sizes if size > min_size] or sizes[:1]
     clock[a.H_NEXT], clock[a.H_LIMIT] = run.sizes_to_try.pop(0), np.inf
     run.crossing_size = float(clock[a.H_NEXT])
@@ -257,9 +276,12 @@ def _find_base_state(run: Run, past: list[TimedState]) -> tuple[TimedState | Non
     return base, min(size, longest)
 
 
-def sizes_across(first_size: float, allowed: float) -> list[float]:
-    """Return step sizes (s) to try across a singular position: `first_size` times SIZE_RATIOS, at most `allowed`."""
-    sizes = [first_size * ratio for ratio in SIZE_RATIOS]
+def sizes_across(first_size: float, allowed: float, near_start: bool = False) -> list[float]:
+    """Return step sizes (s) to try across a singular position, at most `allowed`, relative to `first_size`.
+
+    They are `first_size` times SIZE_RATIOS, and `near_start` also times LARGE_RATIOS.
+    """
+    sizes = [first_size * ratio for ratio in (SIZE_RATIOS + LARGE_RATIOS if near_start else SIZE_RATIOS)]
     return [min(first_size, allowed), *(size for size in sizes[1:] if size < allowed)]
 
 

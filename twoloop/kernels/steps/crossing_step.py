@@ -39,9 +39,10 @@ MAX_SWEEPS, FEW_SWEEPS = 40, 12
 # nodes with pivots below a limit are left out; after FEW_SWEEPS sweeps without convergence, this multiplies the limit
 DISTANCE_FACTOR = 2.0
 MAX_LEFT_OUT_NODES = 9  # the step fails if more nodes are left out
-# indices of the scalars at the end of `memory`. LARGEST_PIVOT, EARLIEST, MAY_APPROACH, BASE (a time, s): arguments of
-# `begin_polynomial`. BEGIN, DURATION, END (s): of the polynomial of the last converged attempt; if none, END = -inf
-LARGEST_PIVOT, EARLIEST, MAY_APPROACH, BASE, BEGIN, DURATION, END, N_STORED = range(8)
+# indices of the scalars at the end of `memory`. LARGEST_PIVOT, EARLIEST, MAY_APPROACH, NODE_DISTANCE, BASE (a time, s):
+# arguments of `begin_polynomial`. BEGIN, DURATION, END (s): of the polynomial of the last converged attempt; if there
+# is none, END = -inf
+LARGEST_PIVOT, EARLIEST, MAY_APPROACH, NODE_DISTANCE, BASE, BEGIN, DURATION, END, N_STORED = range(9)
 # duration of the shortest and of the longest step along the polynomial, relative to the duration of the polynomial
 SHORTEST_PIECE, LONGEST_PIECE = 0.05, 0.2
 # longest time between two evaluations if all nodes are evaluated, relative to the duration of the polynomial
@@ -72,18 +73,19 @@ def memory_size(n):
     return (S + 7) * n + 3 * S + N_STORED
 
 
-def begin_polynomial(memory, largest_pivot, earliest, may_approach, base=None):
+def begin_polynomial(memory, largest_pivot, earliest, may_approach, node_distance=1.0, base=None):
     """Store the conditions for the next polynomial in `memory`, and discard the stored polynomial.
 
     `largest_pivot` is the largest pivot of the run so far; no node may lie before the time `earliest` (s). If
-    `may_approach`, the polynomial may end before the singular position, nearer to it than it begins. It goes through q
-    and v of `base`, the time (s) and state [q, v, ...] of an earlier step that was farther from the singular position;
-    without `base`, through q and v at the beginning of the step.
+    `may_approach`, the polynomial may end before the singular position, nearer to it than it begins. `node_distance`
+    multiplies the distance from the position below which nodes are left out. The polynomial goes through q and v of
+    `base`, the time (s) and state [q, v, ...] of an earlier step that was farther from the singular position; without
+    `base`, through q and v at the beginning of the step.
     """
     stored = memory[-N_STORED:]
     stored[:] = np.nan
     stored[LARGEST_PIVOT], stored[EARLIEST], stored[MAY_APPROACH] = largest_pivot, earliest, may_approach
-    stored[END] = -np.inf
+    stored[NODE_DISTANCE], stored[END] = node_distance, -np.inf
     if base is not None:
         n = (memory.size - 3 * S - N_STORED) // (S + 7)
         stored[BASE], memory[(S + 5) * n : (S + 7) * n] = base[0], base[1][: 2 * n]
@@ -302,7 +304,7 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
     min_node_pivot, duration, t_base = MIN_NEAR_RATIO, h, t
     q_base, v_base = memory[(S + 5) * n : (S + 6) * n], memory[(S + 6) * n : (S + 7) * n]
     if is_estimated:
-        min_node_pivot = near_pivot_ratio(tolerances)
+        min_node_pivot = stored[NODE_DISTANCE] * near_pivot_ratio(tolerances)
     if t + h <= stored[END] + ROUNDING * stored[DURATION] + 4.0 * np.spacing(abs(t)):
         begin, duration = stored[BEGIN], stored[DURATION]
         _polynomial_at(t + h - begin, duration, b, c, a, q_0, v_0, weights_v, weights_q, q_stage, v_stage, a_stage)
