@@ -206,7 +206,8 @@ def _limits(run: Run) -> list[Limits]:
     """Return the limits of steps across a singular position to try, in this order."""
     if run.control[run.a.FIXED_STEP] > 0.0:
         return [Limits(False, True, 1.0, 1.0)]
-    choices = [(False, False, 1.0), (True, False, 1.0), (True, True, 1.0), (True, True, TOLERANCE_FACTOR)]
+    loose = TOLERANCE_FACTOR
+    choices = [(False, False, 1.0), (True, False, 1.0), (True, False, loose), (True, True, 1.0), (True, True, loose)]
     if not (any(run.short_forces) or run.forces_may_be_steep):
         choices.pop(0)
     return [Limits(*choice, distance) for choice in choices for distance in NODE_DISTANCES]
