@@ -5,8 +5,8 @@ of constraints on positions; A contains the rows of non-holonomic constraints A 
 are chosen so that the entries of C_q in these units have similar sizes. The linear range of a row of C_q is how far
 coordinates can move before the row changes much (checks/scales.py). `f` is the kit, with the callbacks.
 
-`compare_traces` compares callbacks with their traces, see generate/traced_values.py. For each traced number, it
-computes a bound of the rounding error in units of EPS, at least the sum of the |terms| of the number.
+`compare_traces` compares callbacks with their traces, see generate/traced_values.py. For each number that a trace
+yields, it also computes a bound of the rounding error, in units of EPS, the spacing of floating-point numbers at 1.
 """
 
 import math
@@ -19,8 +19,8 @@ from twoloop.kernels.evaluation.operations import result_of_operation
 from twoloop.kernels.linalg.dense import largest_of, ldl_factor
 
 NO_ENTRY = 1e-12  # an entry of C_q counts as zero if it is at most this fraction of the largest entry of its row
-MAX_SWEEPS = 20  # largest number of iterations in `column_units`; each fits all rows, then all columns
-NEGLIGIBLE = 1e-6  # `linear_ranges` leaves out a coordinate of a row if it is at most this fraction of the largest one
+MAX_SWEEPS = 20  # largest number of iterations in `column_units`; each fits the units of rows, then of columns
+NEGLIGIBLE = 1e-6  # `linear_ranges` ignores |q_j| if it is at most this fraction of the largest one in the same row
 
 
 @exact
@@ -37,7 +37,7 @@ def _sort(values):
 def _fit_column_units(rows, columns, mask, logs):
     """Fit the units of coordinates, `columns`, to given units of rows, `rows`; return True if no unit changed.
 
-    These units, and the |entries| `logs` of C_q, are logarithms. `mask`: 0 for entries that count as zero, else 1.
+    Units are logarithms; `logs` contains log|entry| of C_q. `mask`: 0 where an entry of C_q counts as zero, else 1.
     """
     is_unchanged = True
     for j in range(columns.size):
@@ -106,8 +106,8 @@ def linear_ranges(coordinates_in_units, radius, negligible, scratch, ranges):
 
     Row i of `coordinates_in_units` contains |q_j| in its unit where row i of C_q has a nonzero entry j, else 0.
     `radius`: norm of each row, divided by its change per unit displacement. If this radius is at most 1, or at most the
-    largest |q_j| of the row, the distance is the radius. Else it is the lower median of the row's |q_j| that are not
-    NEGLIGIBLE, or 1 if no |q_j| of the row exceeds `negligible`.
+    largest |q_j| of the row, the distance is the radius. Else it is 1 if no |q_j| of the row exceeds the argument
+    `negligible`, or the lower median of the row's |q_j|, without those up to NEGLIGIBLE times the largest.
     """
     for i in range(ranges.size):
         largest, n = 0.0, 0
@@ -127,11 +127,11 @@ def linear_ranges(coordinates_in_units, radius, negligible, scratch, ranges):
 
 # flags that `evaluate_start` returns. WELL_FORMED: all values are finite, M is symmetric, no row of C_q or A is zero.
 # CONSISTENT: the state satisfies the constraints up to rounding. Only if M is not constant: DEFINITE if all eigenvalues
-# of M exceed their limit * EIGENVALUE_MARGIN, INDEFINITE if one is below the limit / EIGENVALUE_MARGIN
+# of M exceed a limit, `roundings[2]` * max|M_ij|, times EIGENVALUE_MARGIN; INDEFINITE if one is below limit / this
 WELL_FORMED, CONSISTENT, DEFINITE, INDEFINITE = 1, 2, 4, 8
-MAX_RELATIVE_DISTANCE = 0.5  # recorded sizes apply to q if each q_j moved by at most this fraction of its recorded size
+MAX_RELATIVE_DISTANCE = 0.5  # recorded sizes are used at q if each q_j moved by at most this part of its recorded size
 ROUNDING_OF_ZERO = 2.0**-52  # a coordinate up to this fraction of the largest one may be zero with a rounding error
-EIGENVALUE_MARGIN = 2.0  # if the least eigenvalue of M is within this factor of its limit, other checks must decide
+EIGENVALUE_MARGIN = 2.0  # if the least eigenvalue of M is within this factor of its limit, a check in Python decides
 
 
 def results_size(n: int, n_c: int, n_a: int) -> int:
@@ -204,7 +204,7 @@ def _has_same_entries(rows, entries):
 
 @exact
 def _index_of_near_position(q, rows, n_c, records):
-    """Return the index in `records` (see `evaluate_start`) where the record for a position near q begins; -1: none."""
+    """Return the index in `records` (see `evaluate_start`) where the record of a position near q begins; -1: none."""
     n = q.size
     stride = 2 * n + n_c * n
     for k in range(0, records.size, stride):
@@ -271,7 +271,7 @@ def evaluate_start(f, t, q, v, records, lam, results, mass, rows, shifts, patter
     - lam: multipliers for the callback `reaction_by_q`
     - shifts: displacements of q, relative to max|q|, at which nonzero entries of [C_q; A] are also recorded
     - mass, rows, pattern: zeros on entry; on return M, [C_q; A], and 1 where [C_q; A] is nonzero, else 0
-    - results: `results_size` zeros on entry; on return the force, C, the rates C_t and b, other results, and scratch
+    - results: zeros on entry (size: `results_size`); on return the force, C, rates C_t and b, other results, scratch
     """
     n, n_c, n_rows = q.size, lam.size, rows.shape[0]
     # `results` contains the force, C, the rates C_t and b, and Gamma, one after the other: indices at which these end
@@ -316,7 +316,7 @@ def evaluate_start(f, t, q, v, records, lam, results, mass, rows, shifts, patter
         result_flags = WELL_FORMED
         if _is_consistent(results[force:C], results[C:rate], rows, q, v, records, roundings[0]):
             result_flags |= CONSISTENT
-    if f.constant_mass == 0:  # if the smallest eigenvalue is within EIGENVALUE_MARGIN of its limit, set neither flag
+    if f.constant_mass == 0:  # if the least eigenvalue is within EIGENVALUE_MARGIN of the limit, set neither flag
         if _is_definite(mass, EIGENVALUE_MARGIN * roundings[2], scratch):
             result_flags |= DEFINITE
         elif not _is_definite(mass, roundings[2] / EIGENVALUE_MARGIN, scratch):
@@ -336,7 +336,7 @@ def evaluate_start(f, t, q, v, records, lam, results, mass, rows, shifts, patter
 
 @kernel(types.void(KIT, f8, MATRIX, i8, MATRIX))
 def rows_at_positions(f, t, positions, n_c, rows):
-    """Store in `rows` (zero on entry) C_q (n_c rows) and A for the first of `positions`, then for the second, ..."""
+    """Store in `rows` (zero on entry) C_q (n_c rows) and A at the first of `positions`, then at the second, ..."""
     n_rows = len(rows) // len(positions)
     for k in range(len(positions)):
         begin = k * n_rows
@@ -384,17 +384,17 @@ def kinematics_agree(f, t, q, v, fused, separate, roundings, tolerance, rounding
     return is_close and _is_close(fused[:1].reshape((n_c, 1)), separate[:1].reshape((n_c, 1)), tolerance, roundings)
 
 
-VALUE, BOUND = range(2)  # rows of `nodes`: results of the operations of a trace, and bounds of their rounding errors
+VALUE, BOUND = range(2)  # rows of the array `nodes`: results of a trace's operations; bounds of their rounding errors
 
 EPS = 2.0**-52
 # largest allowed difference of a callback and its trace, apart from rounding, relative to the callback's largest value
 MAX_DIFFERENCE = 1e-9
-ROUNDING_FACTOR = 200.0 * EPS  # allowed rounding error of a traced number, divided by its error bound in `bounds`
+ROUNDING_FACTOR = 200.0 * EPS  # allowed rounding error of a number from a trace, divided by its entry in `bounds`
 
 
 @exact
 def _sum_with_bound(columns, coefficients, constant, nodes, begin, end):
-    """Return constant + sum of coefficients[k] * nodes[VALUE, columns[k]], begin <= k < end, and its error bound."""
+    """Return constant + sum of coefficients[k] * nodes[VALUE, columns[k]], begin <= k < end; and its rounding bound."""
     total, bound = constant, abs(constant)
     for k in range(begin, end):
         term = coefficients[k] * nodes[VALUE, columns[k]]
@@ -405,7 +405,7 @@ def _sum_with_bound(columns, coefficients, constant, nodes, begin, end):
 
 @exact
 def _operation_with_bound(kind, x, bound_x, y, bound_y):
-    """Return the result of the operation `kind` on x and y, and its error bound by the bounds of x and y."""
+    """Return the result of the operation `kind` on x and y; and its rounding bound, given those of x and y."""
     z = result_of_operation(kind, x, y)
     if kind == op.PRODUCT:
         bound = abs(x) * bound_y + abs(y) * bound_x

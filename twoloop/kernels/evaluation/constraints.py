@@ -25,7 +25,7 @@ def constraint_rows(f, w, t, q, G):
 
 @merged
 def clear_rows(f, w):
-    """Set the constraint Jacobian w.G to zero; in the augmented form, set only the entries in w.row_entries to zero."""
+    """Set the constraint Jacobian w.G to zero; in the augmented form, only the entries listed in w.row_entries."""
     if f.form == AUGMENTED:
         for i in range(w.Rate.size):  # the task VERIFY_PATTERN detects nonzero entries elsewhere
             for k in range(w.row_entries[i], w.row_entries[i + 1]):
@@ -73,7 +73,7 @@ def kinematics(f, w, t, q, v):
 
 @merged
 def gather_independent_columns(G, rate, rows, independent, D):
-    """Store right-hand sides for the dependent columns of G in D: rows -G[rows, j] (independent j), and -rate[rows]."""
+    """Store in row j of D the column -G[rows, independent[j]], and in its last row -rate[rows]: right-hand sides."""
     for j in range(independent.size):
         column = independent[j]
         for k in range(rows.size):
@@ -85,20 +85,20 @@ def gather_independent_columns(G, rate, rows, independent, D):
 # `largest_difference_step` is at most MAX_DIFFERENCE_STEP (s) and, in fast motion, at least MIN_STEP_RATIO times this
 MAX_DIFFERENCE_STEP, MIN_STEP_RATIO = 2e-4, 1e-4
 N_DIFFERENCE_STEPS = 12  # number of time steps that `_choose_difference_step` tries, each a quarter of the previous one
-ROUNDING_DISAGREEMENT = 1e-9  # due to rounding, Gamma with time steps e and 2 e may differ by this part of GAMMA_SCALE
-# if Gamma with time steps e and 2 e differs by less than this part of GAMMA_SCALE, e is doubled: less rounding error
+ROUNDING_DISAGREEMENT = 1e-9  # Gamma with time steps e and 2 e may differ by this part of its size, due to rounding
+# if Gamma with time steps e and 2 e differs by less than this part of its size, e is doubled to reduce rounding errors
 NEGLIGIBLE_DISAGREEMENT = 1e-11
 # weights of values at the times 0, e, 2 e and 4 e in one-sided differences of order 2; COARSE: with the step 2 e
 ONE_SIDED_WEIGHTS, ONE_SIDED_WEIGHTS_COARSE = (-1.5, 2.0, -0.5, 0.0), (-0.75, 0.0, 1.0, -0.25)
 ONE_SIDED_STEP_RATIO = 1.0 / 16.0  # ratio of the time step of one-sided differences to that of central differences
-# if terms of G v cancel (G: Jacobian), the rounding error of Gamma is this times (largest |term| / largest time step)
+# assumed rounding error of Gamma if terms of G v cancel, divided by (largest |term| / largest time step); G: Jacobian
 ROUNDING_OF_TERMS = 1e-14
 CONVERGED_CHANGE = 0.01  # the search for a time step ends if Gamma changes by at most this part of its allowed error
 
 
 @exact
 def representable_step(t, h):
-    """Return the step (t + h) - t: the difference of floating-point times (1.2e-7 s apart near 1e9 s) closest to h."""
+    """Return the step closest to h that ends at a floating-point time (near 1e9 s, these are 1.2e-7 s apart)."""
     return (t + h) - t
 
 
@@ -116,7 +116,7 @@ def largest_difference_step(q, v):
 
 @merged
 def _difference_side(w, t, e):
-    """Return 1 (-1) if differences may only use times after (before) t, because C_t or b jumps within 2 e; 0: both."""
+    """Return 0 if C_t and b do not jump within 2 e of t; else the side farther from a jump, 1 (after t) or -1."""
     since_jump, until_jump = t - w.last_jump, w.next_jump - t
     if min(since_jump, until_jump) >= 2.0 * e:
         return 0.0
@@ -170,7 +170,7 @@ def _fill_gamma(f, w, t, q, v, e, first, last):
 
 @merged
 def _max_disagreement(w):
-    """Return the largest allowed difference between Gamma with e and with 2 e; the error of Gamma is smaller."""
+    """Return the limit of the difference between Gamma with time steps e and 2 e; the error of Gamma is smaller."""
     return max(w.gamma_required, ROUNDING_DISAGREEMENT) * w.gamma_scale
 
 
@@ -214,7 +214,7 @@ def gamma_by_differences(f, w, t, q, v, first, last):
     Gamma = -d/de [G v + (C_t, b)](t + e, q + e v) at e = 0, where v is constant.
 
     Errors are relative to w.gamma_scale, the size of Gamma so far. The time step e is w.gamma_step_ratio times
-    `largest_difference_step`. If Gamma with e and with 2 e differ too much (kilohertz drives), choose a new ratio.
+    `largest_difference_step`. If Gamma with e and 2 e differ too much, as with kilohertz drives, choose a new ratio.
     """
     largest_step = largest_difference_step(q, v)
     e = representable_step(t, w.gamma_step_ratio * largest_step)

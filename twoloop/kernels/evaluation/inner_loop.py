@@ -6,9 +6,9 @@ M a + G^T lam = Q (Q: forces), G a = Gamma. G = [C_q; A] contains the Jacobian C
 rows A of non-holonomic constraints A v + b = 0; w.D contains the null space of G. `w` is the workspace.
 
 If a step integrates all coordinates, its states violate the constraints by the error of the formula. Each pass of a
-projection moves positions and velocities towards the nearest state on the constraints, in the metric of M, which does
-not depend on the partition. After a pass, the error of positions is about the square of their correction. The errors of
-velocities and accelerations are about as large as the correction: passes are repeated until it is near rounding.
+projection moves positions and velocities towards the nearest state on the constraints, in the metric of M. This state
+does not depend on a partition. After a pass, the error of positions is about the square of their correction. The errors
+of velocities and accelerations are about as large as the correction: passes are repeated until it is near rounding.
 """
 
 import numpy as np
@@ -58,7 +58,7 @@ def compute_gamma(f, w, t, q, v):
     if w.has_gamma == 1.0 and n_rows == n_c:
         return DONE
     has_gamma, has_gamma_a = f.gamma_given == 1, f.nonholonomic_gamma_given == 1
-    first, last = 0, n_rows  # no callback computes the rows of Gamma from `first` to `last` - 1
+    first, last = 0, n_rows  # no callback is given for rows `first` to `last` - 1 of Gamma
     w.Gamma[:] = 0.0
     if has_gamma:
         f.gamma(t, q, v, f.p, w.Gamma[:n_c])
@@ -135,7 +135,7 @@ def _record_gamma_scale(w, a):
 
 @merged
 def compute_multipliers(f, w, a, lam):
-    """Store the multipliers in lam, G^T lam = Q - M a (G: constraint Jacobian; least norm if rows are redundant)."""
+    """Store in lam the multipliers with G^T lam = Q - M a (G: Jacobian; Q: forces), of least norm if not unique."""
     lam[:] = 0.0
     saddle_point.multipliers(f, w, w.Q, a, lam)
     if w.rows_v.size < lam.size:
@@ -169,7 +169,7 @@ def compute_accelerations_at(f, w, t, q, v, a):
 
 @merged
 def _find_least_correction(f, w):
-    """Store in w.y the x of least x^T M x with G x = w.g (G: constraint Jacobian); return max|x|; inf: not finite."""
+    """Store in w.y the x with G x = w.g (G: Jacobian) and least x^T M x; return max|x|, or inf if it is not finite."""
     w.Q[:] = 0.0
     solve(f, w, w.Q, w.g, w.y)
     largest = 0.0
@@ -199,7 +199,7 @@ def _find_corrections(f, w, v):
 def project_state(f, w, t, q, v, theta, a, lam):
     """Project (q, v) onto the constraints; store accelerations `a` and multipliers lam; return DONE or a failure code.
 
-    q and v change in place. Non-holonomic constraints act on velocities; positions are corrected as these allow.
+    q and v change in place. Corrections of q satisfy A x = 0, where A are the rows of the non-holonomic constraints.
 
     Passes end after one that corrects positions by at most theta, and velocities by at most theta max(1, max|v|). They
     also end after one that corrects positions by at most theta times w.pivot, the smallest pivot of C_q. Velocities are
@@ -309,7 +309,7 @@ def inner_loop(f, w, task, t, q, v, tolerance, a, lam):
 def evaluate(f, w, t, q, v, tolerance, a):
     """Compute dependent from independent entries of q and v, and the accelerations `a`; return DONE or a failure code.
 
-    Velocities and accelerations follow from the Jacobian that was factored last, at q or at most w.reuse from it.
+    `tolerance`: of corrections of q. The Jacobian that was factored last is used, at q or at most w.reuse from it.
     """
     return f.inner(f, w, tasks.EVALUATE, t, q, v, tolerance, a, w.lam)
 
@@ -331,7 +331,7 @@ def evaluate_without_projection(f, w, t, q, v, a):
 
 @merged
 def project(f, w, t, q, v, theta, a, lam):
-    """Project (q, v) onto the constraints in place as described in `project_state`; return DONE or a failure code."""
+    """Project (q, v) onto the constraints, in place; `theta`: of corrections, see `project_state`; return a code."""
     code = f.inner(f, w, tasks.PROJECT, t, q, v, theta, a, lam)
     if code == DONE and has_new_entries(w.G, w.pattern):
         code = f.inner(f, w, tasks.VERIFY_PATTERN, t, q, v, theta, a, lam)
@@ -340,13 +340,13 @@ def project(f, w, t, q, v, theta, a, lam):
 
 @merged
 def restore_constraints(f, w, t, q, v, tolerance):
-    """Compute dependent from independent entries of q and v, up to rounding; return DONE or a failure code."""
+    """Compute dependent from independent entries of q and v; `tolerance`: of corrections of q; return a code."""
     return f.inner(f, w, tasks.RESTORE, t, q, v, tolerance, w.x, w.lam)
 
 
 @merged
 def accelerations(f, w, t, q, v, a, lam):
-    """Store accelerations `a` and multipliers lam after `restore_constraints`; return DONE or a failure code."""
+    """Store `a` and lam at the state (q, v) from `restore_constraints`, called last; return DONE or a failure code."""
     return f.inner(f, w, tasks.ACCELERATIONS, t, q, v, 0.0, a, lam)
 
 
@@ -370,7 +370,7 @@ def prepare_mass(f, w, t, q):
 
 @merged
 def renew_partition(f, w, t, q):
-    """Choose a partition at a consistent q, and store its sign of det C_qd in w; return DONE or a failure code."""
+    """Choose a partition at a consistent q; store sign(det C_qd) in w (C_qd: dependent columns); return a code."""
     return f.inner(f, w, tasks.RENEW_PARTITION, t, q, q, 0.0, w.x, w.lam)
 
 
@@ -394,7 +394,7 @@ def rounding_floor(q):
 
 @kernel(INNER)
 def generated_inner_loop(f, w, task, t, q, v, theta, a, lam):
-    """Do a task by generated code or, if none succeeds, by the general inner loop; return DONE or a failure code."""
+    """Do a task by generated code or, if this is missing or fails, by the general inner loop; return a code."""
     if task == tasks.EVALUATE_WITHOUT_PROJECTION:
         w.n_evaluations += 1
         w.n_factorizations += 1

@@ -14,12 +14,12 @@ from twoloop.kernels.data.common import compiled, exact
 # product of two Taylor series; the coefficient of order k of the second series is not known until the linear equations
 # of order k, which contain the product, are solved
 PRODUCT, RECIPROCAL, SQUARE_ROOT, EXPONENTIAL, SINE, COSINE, LOGARITHM, ARCTANGENT, PENDING, SUM, RESULT = range(11)
-# columns of a table, which has one row for each operation. A node is a number that a program reads or computes; a term
-# is a coefficient times a node. KIND: kind of the operation. NODE: index of the node that receives the result. Argument
+# columns of a table, which has one row for each operation. `nodes` are the numbers that a program reads and computes; a
+# term is a coefficient times one of them. KIND: kind of the operation. NODE: index of its result in `nodes`. Argument
 # 1 is a constant plus the terms FIRST to SECOND - 1; argument 2 is a constant plus the terms SECOND to END - 1
 KIND, NODE, FIRST, SECOND, END, N_COLUMNS = range(6)
-# A program is a vector of integers: N_SIZES sizes (at the indices below); the rows of the table; for each term, the
-# index of its node; for each result, its index in w.Gamma or in the flattened C_q. The results are the last nodes
+# A program is a vector of integers: N_SIZES sizes (at the indices below); the rows of the table; for each term, its
+# index in `nodes`; for each result, its index in w.Gamma or in the flattened C_q. The last of `nodes` are the results
 N_NODES, N_ROWS, N_TERMS, N_RESULTS, N_SIZES = range(5)
 
 
@@ -49,10 +49,7 @@ def result_of_operation(kind, x, y):
 
 @exact
 def affine_sum(nodes, table, columns, numbers, coefficients, constant, begin, end):
-    """Return an argument of an operation: numbers[constant] plus the terms `begin` to `end` - 1.
-
-    A term is a coefficient times a node. For `columns` and `coefficients` see `run_table`.
-    """
+    """Return numbers[constant] + sum of (coefficient k) * (its entry of `nodes`), begin <= k < end; see `run_table`."""
     total = numbers[constant]
     for k in range(begin, end):
         total = total + numbers[coefficients + k] * nodes[int(table[columns + k])]
@@ -61,10 +58,10 @@ def affine_sum(nodes, table, columns, numbers, coefficients, constant, begin, en
 
 @exact
 def run_table(table, rows, n_rows, columns, numbers, coefficients, constants, nodes, inputs, t, q, v):
-    """Do the operations of a table: store t, q and v in `nodes` from index `inputs` on, then compute all other nodes.
+    """Do the operations of a table: store t, q, v in `nodes` from index `inputs` on, then the results of operations.
 
     `table` contains integers, or whole floats if it is among the parameters of a model. In `table`, the rows, one for
-    each operation, begin at index `rows`, and the node indices of the terms at index `columns`. In `numbers`, the
+    each operation, begin at index `rows`; the list of the terms' indices in `nodes` at `columns`. In `numbers`, the
     coefficients of the terms begin at index `coefficients`, and the constants, two for each row, at index `constants`.
     """
     nodes[inputs] = t
@@ -81,7 +78,7 @@ def run_table(table, rows, n_rows, columns, numbers, coefficients, constants, no
 
 @exact
 def _run_program(program, numbers, nodes, t, q, v):
-    """Compute the `nodes` of a program that replaces a callback, given t, q, v and its constants and coefficients."""
+    """Run a program that replaces a callback: fill `nodes` with t, q, v and results (`numbers`: its constants)."""
     n_rows = program[N_ROWS]
     columns = N_SIZES + N_COLUMNS * n_rows
     run_table(program, N_SIZES, n_rows, columns, numbers, 2 * n_rows, 0, nodes, 0, t, q, v)
@@ -89,7 +86,7 @@ def _run_program(program, numbers, nodes, t, q, v):
 
 @exact
 def _result_indices(program):
-    """Return how many results there are, where they begin in `nodes`, and where their targets begin in `program`."""
+    """Return the number of results, their first index in `nodes`, and the first index in `program` of their targets."""
     n = program[N_RESULTS]
     return n, program[N_NODES] - n, N_SIZES + N_COLUMNS * program[N_ROWS] + program[N_TERMS]
 

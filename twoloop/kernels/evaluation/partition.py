@@ -36,8 +36,8 @@ from twoloop.kernels.linalg.markowitz_lu import (
     solve_rows,
 )
 
-RANK_TOLERANCE = 1e-11  # pivots count as zero up to this limit, if the largest entry of each row is 1
-PARTITION_CHANGED = -1  # return code: the task is done as for DONE, and a new partition was adopted
+RANK_TOLERANCE = 1e-11  # pivots up to this limit count as zero, if rows are scaled to maxima of 1 first
+PARTITION_CHANGED = -1  # return code: the task succeeded, as for DONE, and the partition has changed
 MAX_ROWS_ELIMINATED = 200  # with more independent constraints, `min_pivot_ratio` does no elimination, to save time
 SENSITIVITY_GROWTH = 3.0  # a partition is poor if the sensitivity of dependent coordinates has grown by this factor
 
@@ -109,8 +109,8 @@ def min_pivot_ratio(f, w, t, q):
     """Return the ratio of the smallest to the largest pivot of [C_q; A] at (t, q), to detect singular positions.
 
     A: rows of the non-holonomic constraints. The ratio is 0 if the rank is lower than before. Rows are not scaled,
-    because scaling would hide that a row has a small norm at a singular position. In the fixed-order form, return
-    w.pivot of the last factorization; with more than MAX_ROWS_ELIMINATED rows, w.pivot of the last partition.
+    because scaling would hide that a row has a small norm at a singular position. To save time, return w.pivot instead
+    in the fixed-order form (of its last factors), or with more than MAX_ROWS_ELIMINATED rows (of the last partition).
     """
     if f.form == FIXED_ORDER or w.rows_v.size > MAX_ROWS_ELIMINATED:
         return w.pivot
@@ -152,7 +152,7 @@ def _find_pivot_order(w, max_rank, max_rank_v):
     w.pivot = abs(G[rank - 1, rank - 1]) if rank > 0 else 1.0
     if n_rows == n_c:
         return rank, rank
-    last = rank  # end of the rows that may be pivots: each row of A changes places with a redundant row of C_q
+    last = rank  # rows before this index may get pivots: each row of A is exchanged with a redundant row of C_q
     for i in range(n_c, n_rows):
         row_order[last], row_order[i] = row_order[i], row_order[last]
         for j in range(G.shape[1]):
@@ -223,7 +223,7 @@ def write_programs(w):
 
 @compiled
 def _record_columns_of_entries(w):
-    """Store in w.row_entries where the list of each row of w.G begins, then the lists: columns where w.pattern is 1."""
+    """Store in w.row_entries lists of the columns where w.pattern is 1, one for each row, after the lists' begins."""
     n_rows = w.Rate.size
     index = n_rows + 1
     for i in range(n_rows):
@@ -323,7 +323,7 @@ def choose_oriented_partition(f, w, t, q):
 
 @compiled
 def _largest_coefficient(w):
-    """Return the largest |coefficient| of an independent row in a redundant row, with rows scaled to maxima of 1."""
+    """Return the largest |coefficient| with which an independent row enters a redundant row, in rows of maximum 1."""
     rows = rows_of(w.index_v)
     largest = 0.0
     begin = 0
@@ -343,8 +343,8 @@ def _largest_coefficient(w):
 def partition_is_poor(w):
     """Return True if the dependent coordinates have become so sensitive that a new partition is needed.
 
-    Their sensitivity to the independent coordinates is max|C_qd^-1 C_qi|, from w.D; C_qd and C_qi are the columns of
-    the dependent and independent coordinates in C_q. It is near 1 after full pivoting, and grows without bound where
+    Their sensitivity to the independent coordinates is max|C_qd^-1 C_qi| (w.D); C_qd and C_qi are the columns of the
+    dependent and the independent coordinates in C_q. It is near 1 after full pivoting, and grows without bound where
     the independent coordinates stop being valid. Also return True if the largest coefficient of an independent row in a
     redundant row has grown: it grows where independent rows become dependent while the rank stays the same.
     """
@@ -365,14 +365,14 @@ def partition_is_poor(w):
 
 
 MAX_ITERATIONS = 25  # largest number of Newton iterations for positions; quadratic convergence needs 2 to 5
-CONTRACTION = 0.5  # Newton's method converges if each correction is at most this fraction of the previous one
+CONTRACTION = 0.5  # Newton's method counts as converging while each correction is at most this part of the previous one
 ROUNDING_OF_CORRECTIONS = 1e-12  # corrections of positions up to this size, relative to max|q|, may be due to rounding
 # if all constraints hold up to rounding, the limit ROUNDING_OF_CORRECTIONS is multiplied by this factor, because small
 # bodies amplify errors: the rounding error of a position of 1 m turns a rod of 1 mm by 1e-13 rad, a chain by more
 AMPLIFICATION = 1e3
 # constraint i holds up to rounding if |C_i| is at most this fraction of the largest |G_ij q_j| over j; G: Jacobian C_q
 ROUNDING_OF_ROWS = 2e-15
-MIN_CORRECTION = 10.0  # smallest tolerance of corrections in a projection, in rounding errors of positions, w.rounded
+MIN_CORRECTION = 10.0  # smallest tolerance of corrections in a projection, divided by w.rounded (rounding error of q)
 # constraint i is violated if |C_i| exceeds this fraction of max(1, max|q|) times the largest entry of its Jacobian row,
 # or if |(C_q v + C_t)_i| exceeds this fraction of max(1, max|v|) times this entry
 MAX_VIOLATION = 1e-7
@@ -414,7 +414,7 @@ def evaluate_and_factor_columns(f, w, t, q):
 
 @compiled
 def is_rounding_of_positions(w, q, correction):
-    """Return True if `correction`, the largest change of a position, may be due to rounding, see AMPLIFICATION."""
+    """Return True if `correction`, the largest change of a position, may be a rounding error (limits: see above)."""
     limit = ROUNDING_OF_CORRECTIONS * largest_of(q)
     return correction <= limit or (correction <= AMPLIFICATION * limit and _is_on_constraints(w, q))
 

@@ -6,15 +6,15 @@ metric of M. If sparse factors do not show which rows are independent, a task re
 with the forms of linalg/saddle_point.py, which methods with a partition always use. Callbacks may return the nonzero
 entries of C_q; then no array has n_c times n_q numbers. They may also fill dense matrices; then entries are copied.
 
-If rows of G = C_q are redundant, many multipliers lam have the same reactions b = G^T lam. The shortest lam is used. It
+If rows of G = C_q are redundant, many multipliers lam have the same reactions p = G^T lam. The shortest lam is used. It
 is G x for some x, and both solve
 
-    [0  G^T] [ x ]   [b]
+    [0  G^T] [ x ]   [p]
     [G  -1 ] [lam] = [0]
 
 This matrix is singular, because the constraints leave some motion free. If a small positive diagonal matrix W replaces
 0, the matrix is quasi-definite, and can be factored in any order (Vanderbei 1995, doi 10.1137/0805005), so also by the
-program for [M G^T; G 0]. Iterative refinement converges to the shortest lam, because b is a combination of rows of G:
+program for [M G^T; G 0]. Iterative refinement converges to the shortest lam, because p is a combination of rows of G:
 let s be a singular value of G with its columns scaled to norm 1; then each refinement divides the error along the
 singular vector by 1 + s^2 / REGULARIZATION.
 """
@@ -65,12 +65,12 @@ from twoloop.kernels.linalg.symbolic_factorization import (
     pivot_order_of,
 )
 
-# pivot / (squared norm of the row) is the squared sine of the angle between a row of C_q and previous rows
+# pivot / (squared norm of a row of C_q) is the squared sine of its angle to the span of previous rows, in metric M^-1
 SUSPECT_PIVOT = 1e-6  # up to this squared sine, the pivot may be a rounding error: check whether the row is redundant
 MIN_PIVOT = 1e-10  # factors are accurate if pivot / (squared norm of the row) exceeds this for all independent rows
-MAX_DEPENDENT_SINE = 1e-11  # a row is redundant if the sine of its angle to the independent rows is at most this
+MAX_DEPENDENT_SINE = 1e-11  # a row is redundant if the sine of its angle to the independent rows' span is at most this
 PROJECT_STAGES = 2.0  # value of w.nearly_singular that means: project stages onto the constraints before evaluations
-# if the smallest pivot / (squared norm of its row) is below the first limit, solutions are refined once; second: twice
+# solutions are refined once (twice) if the smallest pivot / (squared norm of its row) is at most the first (second)
 REFINE_ONCE_BELOW, REFINE_TWICE_BELOW = 1e-3, 1e-7
 
 
@@ -107,9 +107,9 @@ def fill_jacobian_values(f, w, t, q):
 
 @compiled
 def _factor_entries(f, w, min_sine_square):
-    """Factor [M G^T; G 0] from its entries in w; return the smallest sin^2 of the angle of a row of G to previous rows.
+    """Factor [M G^T; G 0]; return the smallest sin^2 of the angle between a row of G and the span of previous rows.
 
-    Rows with a sin^2 up to `min_sine_square` become redundant, and do not count. If M is not definite, return -1.
+    Rows with a sin^2 up to `min_sine_square` become redundant, and do not count. M not positive definite: return -1.
     """
     w.n_factorizations += 1
     stiffness = w.solutions[3 * f.ldl_program[N_PIVOTS] :]
@@ -122,7 +122,7 @@ def _factor_entries(f, w, min_sine_square):
 
 @compiled
 def _failure_of_factorization(w, t, q):
-    """Return the code of a failed factorization: NOT_FINITE, NEEDS_DENSE (M not definite) or SINGULAR (other cases)."""
+    """Return why a factorization failed: NOT_FINITE, NEEDS_DENSE (M is not positive definite) or else SINGULAR."""
     if not finite_vector(w.mass_values):
         return not_finite(w, MASS, t, q)
     if not finite_vector(w.jacobian_values):
@@ -175,7 +175,7 @@ def n_refinements(w):
 
 @compiled
 def _sine_to_independent_rows(f, w, row, square):
-    """Return the sine of the angle between a row g of G and the independent rows, in the metric of M^-1.
+    """Return the sine of the angle between a row g of G and the span of the independent rows, in the metric of M^-1.
 
     `row`: index of g in G; `square`: g M^-1 g^T, the squared norm of g.
     """
@@ -241,7 +241,7 @@ def _adopt_rows(w):
 
 @compiled
 def choose_rows(f, w, t, q):
-    """Choose and store independent rows at (t, q); return a code: RANK_DIFFERS if w has space for another number."""
+    """Choose and store independent rows at (t, q); return a code: RANK_DIFFERS if w is allocated for another number."""
     w.n_partitions += 1
     fill_mass_values(f, w, t, q)
     fill_jacobian_values(f, w, t, q)
@@ -257,8 +257,8 @@ def choose_rows(f, w, t, q):
 
 
 REGULARIZATION = 1e-11  # diagonal entry j of W (module docstring), relative to the sum of squares of column j of C_q
-CONVERGED_RESIDUAL = 1e-14  # multipliers are refined until reactions differ from the given ones by at most this part
-MAX_RESIDUAL = 1e-9  # if this difference no longer decreases, multipliers are accepted if it is at most this part
+CONVERGED_RESIDUAL = 1e-14  # multipliers are refined until reactions agree with the given ones up to this fraction
+MAX_RESIDUAL = 1e-9  # if refinement stops earlier, multipliers are accepted if reactions agree up to this fraction
 MAX_SOLUTIONS = 30  # largest number of refinements of the multipliers of least norm
 
 
@@ -288,9 +288,9 @@ def _fill_least_norm_matrix(program, jacobian, n_q, weights, values):
 
 @compiled
 def _fill_residual(program, jacobian, force, x, r):
-    """Store the residual [b - G^T lam, lam - G x] in r; return max|b - G^T lam| / max|b|.
+    """Store the residual [p - G^T lam, lam - G x] in r; return max|p - G^T lam| / max|p|.
 
-    The argument x contains [x, lam]. b: `force`, reactions that the multipliers lam must have; G: Jacobian `jacobian`.
+    The argument x contains [x, lam]. p: `force`, reactions that the multipliers lam must have; G: Jacobian `jacobian`.
     """
     n_q, largest, residual = force.size, 0.0, 0.0
     copy(force, r[:n_q])
@@ -407,7 +407,7 @@ def _compute_multipliers(f, w, lam):
 
 @compiled
 def _find_least_correction(f, w):
-    """Store in w.unknowns[:n] the least x, in the metric of M, with G x = w.g; return max|x|, or inf if not finite."""
+    """Store in w.unknowns[:n] the x with C_q x = w.g and least x^T M x; return max|x|, or inf if it is not finite."""
     n = w.unknowns.size - w.g.size
     w.unknowns[:n] = 0.0
     copy(w.g, w.unknowns[n:])
@@ -463,7 +463,7 @@ def _project_state(f, w, t, q, v, theta):
         is_last = is_last or correction_q <= w.pivot * theta
         if not is_last and correction_q > CONTRACTION * last_correction:
             limit = ROUNDING_OF_CORRECTIONS * largest_of(q)
-            # do not apply this correction: if it is noise, it would move light bodies much more than heavy ones
+            # do not apply this correction: rounding errors in it would move light bodies much more than heavy ones
             return (
                 DONE
                 if correction_q <= limit or (correction_q <= AMPLIFICATION * limit and _is_on_constraints(f, w, q))
@@ -479,7 +479,7 @@ def _project_state(f, w, t, q, v, theta):
 
 @compiled
 def _check_redundant_rows(f, w, t, q, v):
-    """Return DONE if (q, v) satisfies all constraints, else ROWS_CONTRADICT; w must contain C_q and C_t there."""
+    """Return DONE if (q, v) satisfies all constraints, else ROWS_CONTRADICT; w must contain C_q and C_t at (t, q)."""
     w.C[:] = 0.0
     f.constraint(t, q, f.p, w.C)
     size, speed = max(1.0, largest_of(q)), max(1.0, largest_of(v))
@@ -516,7 +516,7 @@ def _do_task_between_evaluations(f, w, task, t, q, v, a, lam):
 
 @kernel(INNER)
 def sparse_inner_loop(f, w, task, t, q, v, tolerance, a, lam):
-    """Do `task` (see tasks.py) by sparse factors; return a code. For SOLVE, q and v are r and c of `_solve_system`."""
+    """Do `task` (see tasks.py) by sparse factors; return a code. SOLVE: q, v are r, c in M a + G^T lam = r, G a = c."""
     if task in (tasks.EVALUATE, tasks.EVALUATE_WITHOUT_PROJECTION):
         code = STOPPED if w.time_is_up == 1.0 else DONE
         if code == DONE and task == tasks.EVALUATE and w.nearly_singular == PROJECT_STAGES:
