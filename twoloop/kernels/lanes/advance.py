@@ -130,7 +130,7 @@ def advance_lanes(
     options : options of the method, see control.py; times : (n_t,) output times, the last of which is t1; numbers :
     (n_runs, n_numbers) data of the generated code; q0, v0 : (n_runs, n) initial states. Results are stored in out_q and
     out_v : (n_runs, n, n_t) states at `times`; out_a : (n_runs, n + n_rows) accelerations and multipliers at t1;
-    status : (n_runs,) codes, such as ENDED; n_steps, n_evaluations : (n_runs,) numbers that are increased.
+    status : (n_runs,) codes, such as ENDED; n_steps, n_evaluations : (n_runs,) counts, which are increased.
     """
     n, n_rows, order = settings[at.N], settings[at.N_ROWS], settings[at.ORDER]
     _, new, _, _, a, _, _, _ = offsets_in_work(n, n_rows, numbers.shape[1])

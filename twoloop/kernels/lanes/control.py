@@ -21,7 +21,7 @@ from twoloop.kernels.lanes.layout import (
     remove_run,
 )
 
-# indices in `options`, after the step-size rule (N_RULE numbers). The options of the method in a single run follow
+# indices in `options`, after N_RULE numbers of the step-size rule; the options of the method, as outside lanes, follow
 # - JUMP_RATIO: largest ratio of true error to error estimate in a step in which a force jumps
 # - FIRST: first step size, relative to the shortest time scale at the start; LEAST: smallest tolerance of a coordinate
 JUMP_RATIO, FIRST, LEAST, N_HEAD = range(N_RULE, N_RULE + 4)
@@ -31,11 +31,11 @@ MAX_RATIO_AFTER_REJECTION = 0.95  # largest ratio of the next step size to a rej
 # if a step would end before t1 by at most this fraction of the time left, it is lengthened to end at t1
 END_ROUNDING = 1e-10
 # if a step of size h fails because its stages or its end cannot be computed, step sizes are limited to LIMIT_FACTOR * h
-# until LIMIT_MEMORY steps have been accepted. The values are those of `Plan`
+# until more than LIMIT_MEMORY steps have been accepted. The values equal those of the class `Plan`
 LIMIT_FACTOR = 0.7
 LIMIT_MEMORY = 10.0
 LEAST_FIRST_STEP = 20.0 * at.SHORTEST  # lower bound of the first step size, relative to |t0|
-MAX_REJECTED = 30  # after more successive rejected steps, a run leaves its lane, because the motion may be stiff
+MAX_REJECTED = 30  # a run with more successive rejected steps leaves its lane, because the motion may be stiff
 MAX_STEPS = 100_000  # largest number of steps of a run in a lane: the user cannot interrupt runs in lanes
 
 
@@ -107,7 +107,7 @@ def choose_steps(work, control, status, n_steps):
 
 @compiled
 def set_end(work, control):
-    """Set T_NEW, the time of the new state, to T + X (beginning of the step plus time since then), or to exactly t1."""
+    """Set T_NEW, the time of the new state, to T + X (beginning of the step plus time since then); at the end: t1."""
     for k in range(LANES):
         t, x = work[at.T * LANES + k], work[at.X * LANES + k]
         work[at.T_NEW * LANES + k] = control[at.T1] if x == control[at.T1] - t else t + x

@@ -64,7 +64,7 @@ LANES = 8 if has_wide_vectors() else 4  # number of runs at once: the number of 
     _MORE_PAST,
     N_FIELDS,
 ) = range(31)
-# names of generated functions of (order, control, work); generate/lane_code.py has a method of this name for each
+# names of generated functions, called with (order, control, work); generate/lane_code.py writes them
 TASKS = ("correct_positions", "correct_state", "check_redundant_rows", "compute_prediction_error", "commit")
 TASKS_OF_STARTS, TASKS_OF_STAGES, TASKS_OF_EXPLICIT = ("compute_rows",), ("compute_accelerations",), ("compute_stages",)
 TASKS_OF_SERIES = (
@@ -178,7 +178,7 @@ def _add_product_in_four_lanes(work, t, p, q, sign):
 
 @compiled
 def add_product(work, target, x, y, sign):
-    """Add sign * x * y to `target`; read four lanes before writing one, to allow SIMD although vectors may overlap."""
+    """In each lane, add sign * x * y to `target` (offsets); read four lanes before writing one, to allow SIMD."""
     for k in range(0, LANES, 4):
         _add_product_in_four_lanes(work, target * LANES + k, x * LANES + k, y * LANES + k, sign)
 
@@ -192,7 +192,7 @@ def _raised_value(work, target, error, factor, before, after, atol, rtol):
 
 @compiled
 def raise_to_ratio(work, target, error, factor, before, after, atol, rtol):
-    """In each lane, raise `target` to |error| * factor / (atol + rtol * max(|before|, |after|)) if it is smaller."""
+    """In each lane, raise `target` (an offset) to |error| * factor / (atol + rtol * max(|before|, |after|))."""
     for k in range(0, LANES, 4):
         m, e, f, x, y = target * LANES + k, error * LANES + k, factor * LANES + k, before * LANES + k, after * LANES + k
         m0 = _raised_value(work, m, e, f, x, y, atol, rtol)
@@ -204,9 +204,9 @@ def raise_to_ratio(work, target, error, factor, before, after, atol, rtol):
 
 @merged
 def _multiply_number(work, target, imaginary_target, x, imaginary):
-    """Multiply the number `target` by the number x in each lane; if `imaginary` > 0, both are complex.
+    """In each lane, multiply the number at offset `target` by that at offset x (real if `imaginary` is 0).
 
-    Then the imaginary part of `target` is `imaginary_target` vectors after its real part; that of x, `imaginary`.
+    If `imaginary` > 0, both are complex, with imaginary parts at target + imaginary_target and x + imaginary.
     """
     for k in range(LANES):
         t, p = target * LANES + k, x * LANES + k
@@ -220,9 +220,9 @@ def _multiply_number(work, target, imaginary_target, x, imaginary):
 
 @merged
 def _subtract_product(work, target, x, y, imaginary, imaginary_y):
-    """Subtract the product x * y from the number `target` in each lane; if `imaginary` > 0, all three are complex.
+    """In each lane, subtract x * y from `target`; the arguments are offsets of numbers (real if `imaginary` is 0).
 
-    Then the imaginary part of x is `imaginary` vectors after its real part; those of y and `target`, `imaginary_y`.
+    If `imaginary` > 0, all three are complex. Imaginary parts: x + imaginary, y + imaginary_y, target + imaginary_y.
     """
     add_product(work, target, x, y, -1.0)
     if imaginary > 0:
@@ -239,16 +239,16 @@ def _exchange_entries(work, first, second, k):
 
 @merged
 def _pivot_magnitude(work, entry, imaginary, k):
-    """Return |x| of a real matrix entry x in lane k, or |re x| + |im x| of a complex one; `entry`: offset of x."""
+    """Return |x| of the number x at offset `entry` in lane k or, if `imaginary` > 0 (complex), |re x| + |im x|."""
     magnitude = abs(work[entry * LANES + k])
     return magnitude if imaginary == 0 else magnitude + abs(work[(entry + imaginary) * LANES + k])
 
 
 @compiled
 def _choose_pivot(work, matrix, pivots, n, imaginary, c):
-    """In each lane, exchange row c with the row below that has the largest entry in column c; invert this pivot.
+    """In each lane, exchange row c with the row from c on that has the largest entry in column c; invert this pivot.
 
-    Store the index of the exchanged row in `pivots`. In lanes where the pivot is zero, set ACTIVE to 0.
+    Store that row's index in `pivots`. If the pivot is zero, set ACTIVE to 0. For `imaginary` see `factor_matrices`.
     """
     for k in range(LANES):
         best, largest = c, _pivot_magnitude(work, matrix + c * n + c, imaginary, k)
@@ -275,7 +275,10 @@ def _choose_pivot(work, matrix, pivots, n, imaginary, c):
 
 @compiled
 def factor_matrices(work, matrix, pivots, n, imaginary):
-    """Replace a matrix (n, n) in each lane by its LU factors, with inverted pivots; store row exchanges in `pivots`."""
+    """Replace a matrix (n, n) in each lane by its LU factors, with inverted pivots; store row exchanges in `pivots`.
+
+    Offset from the real to the imaginary part of an entry: `imaginary`; 0: the matrix is real.
+    """
     for c in range(n):
         _choose_pivot(work, matrix, pivots, n, imaginary, c)
         for i in range(c + 1, n):
@@ -289,7 +292,7 @@ def factor_matrices(work, matrix, pivots, n, imaginary):
 def solve_systems(work, matrix, pivots, n, imaginary, x):
     """Replace a right-hand side x (n) in each lane by the solution, using the factors from `factor_matrices`.
 
-    If `imaginary` > 0, the system is complex, and n imaginary parts follow the real parts of x.
+    If `imaginary` > 0, the system is complex (see `factor_matrices`), and n imaginary parts follow the real parts of x.
     """
     imaginary_x = n if imaginary > 0 else 0
     for c in range(n):

@@ -75,7 +75,7 @@ from twoloop.kernels.steps.velocity_errors import LONGEST_GAPS, SLOW_FACTOR, STE
     _IMAGINARY,  # scratch: imaginary part of the right-hand side and solution of a linear system
     N_VECTORS,
 ) = range(15)
-# indices of blocks (s, n), for s stages: accelerations at the stages of this step; the same for the previous step;
+# indices of blocks (s, n), for s stages: accelerations at the stages of this step; those of the previous step;
 # residuals of Newton's method; its corrections of the accelerations. The weights (s, s) follow these blocks
 STAGES, PREVIOUS, RESIDUAL, CHANGES, N_BLOCKS = range(5)
 # indices of matrices (n, n): derivatives of the accelerations by q and by v; then, for each linear system of Newton's
@@ -145,7 +145,7 @@ def _evaluate_middle_state(code, settings, control, c, work, new, a, memory):
 def compute_derivatives(code, settings, control, c, work):
     """Store DERIVATIVE_Q and DERIVATIVE_V, derivatives of accelerations by q and v, in the middle of the step.
 
-    "Middle" is the time of a stage, because forces that act only between two stages must not affect the step.
+    The middle is the node nearest to it, because forces that act only between two nodes must not affect the step.
     """
     n, order = settings[at.N], settings[at.ORDER]
     _, new, _, _, a, _, _, memory = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])
@@ -197,8 +197,8 @@ def factor_systems_of_lanes(settings, method_options, s, work):
 def predict_stages(settings, c, work, begins):
     """Store in STAGES a prediction of the stage accelerations: the polynomial through those in PREVIOUS.
 
-    If the step is longer than MAX_STEP_RATIO times the step of PREVIOUS, all are equal to those at the beginning of the
-    step. `begins` is 1 if PREVIOUS belongs to the last step, and 0 if it belongs to this step.
+    If the step is longer than MAX_STEP_RATIO times the step of PREVIOUS, predict the accelerations at its beginning.
+    `begins` is 1 if PREVIOUS belongs to the last step, and 0 if it belongs to this step.
     """
     n = settings[at.N]
     memory = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])[7]
@@ -410,7 +410,7 @@ def _store_embedded_estimate(settings, method_options, A, work, memory):
         total += e[i]
     for i in range(n * LANES):
         work[e_q * LANES + i] = (gamma0 + total) * work[begin * LANES + i]
-    for j in range(s):  # add e_j times the change of v from the beginning of the step to stage j, H sum_k A_jk a_k
+    for j in range(s):  # add the formula's weight e_j times the change of v until stage j, H sum_k A_jk a_k
         sum_rows(A[j], stage_rows, vector_range(work, sums, n))
         for i in range(n * LANES):
             work[e_q * LANES + i] += e[j] * work[at.H * LANES + i % LANES] * work[sums * LANES + i]

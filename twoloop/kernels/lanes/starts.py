@@ -19,8 +19,8 @@ from twoloop.kernels.data.common import INTEGERS, KIT, compiled, kernel, merged
 from twoloop.kernels.lanes import layout as at
 from twoloop.kernels.lanes.layout import CODE, LANES, copy_vectors, fill_field, offsets_in_work
 
-DIAGONAL_SHIFT = 1e-15  # added to the diagonal of G G^T (G: Jacobian with rows of norm 1), which is not singular then
-ITERATION_SHIFT = 1e-8  # replaces DIAGONAL_SHIFT in inverse iterations, because some eigenvalues of G G^T are zero then
+DIAGONAL_SHIFT = 1e-15  # added to the diagonal of G G^T (G: Jacobian with rows of norm 1), so that it is not singular
+ITERATION_SHIFT = 1e-8  # replaces DIAGONAL_SHIFT in inverse iterations for redundant constraints: G G^T is singular
 MAX_REDUNDANT_EIGENVALUE = 1e-4  # up to this eigenvalue, an eigenvector of G G^T counts as a redundant constraint
 N_REDUNDANT_ITERATIONS = 5  # number of inverse iterations per redundant constraint; few suffice for tiny eigenvalues
 GOLDEN_SECTION = 0.6180339887498949  # inverse iterations start from irregular numbers: multiples of this one, modulo 1
@@ -28,7 +28,7 @@ GOLDEN_SECTION = 0.6180339887498949  # inverse iterations start from irregular n
 
 @merged
 def _subtract_in_four_lanes(work, target, x, x_stride, y, y_stride, count):
-    """Subtract `count` products work[x] * work[y], with strides of x and y, from work[target]; treat four lanes so."""
+    """For four adjacent lanes, subtract `count` products work[x] * work[y] from work[target]; add strides to x, y."""
     t0, t1, t2, t3 = work[target], work[target + 1], work[target + 2], work[target + 3]
     for _ in range(count):
         t0 -= work[x] * work[y]
@@ -42,9 +42,9 @@ def _subtract_in_four_lanes(work, target, x, x_stride, y, y_stride, count):
 
 @compiled
 def subtract_products(work, target, x, x_stride, y, y_stride, count):
-    """In each lane, subtract `count` products from the vector `target`.
+    """In each lane, subtract `count` products of two numbers from the number at offset `target` in `work`.
 
-    Product i is that of the vectors with the offsets x + i * x_stride and y + i * y_stride in `work`.
+    Product i multiplies the number at offset x + i * x_stride by the number at offset y + i * y_stride.
     """
     for k in range(0, LANES, 4):
         x_0, y_0 = x * LANES + k, y * LANES + k
@@ -53,7 +53,7 @@ def subtract_products(work, target, x, x_stride, y, y_stride, count):
 
 @merged
 def subtract_row_product(work, target, entries, pattern, i, y):
-    """Subtract from `target` the dot product of row i of a sparse matrix and the vector y, in each lane.
+    """In each lane, subtract the dot product of row i of a sparse matrix and the vector at offset y from `target`.
 
     `entries`: offset of the nonzero entries of the matrix, row by row; `pattern`: their columns, see module docstring.
     """
@@ -63,7 +63,7 @@ def subtract_row_product(work, target, entries, pattern, i, y):
 
 @compiled
 def _multiply_vector(work, target, factor):
-    """Multiply the vector `target` by the vector `factor` in each lane."""
+    """In each lane, multiply the number at offset `target` by the number at offset `factor`."""
     for k in range(LANES):
         work[target * LANES + k] *= work[factor * LANES + k]
 
@@ -128,7 +128,7 @@ def factor_gram(work, pattern, moves, n_rows, n_redundant, G, row, factors):
 
 @compiled
 def _find_redundant_combinations(work, pattern, n_rows, n_redundant, row, factors):
-    """Store in `factors` Z, eigenvectors of G G^T for the n_redundant smallest eigenvalues; NaN if one is large."""
+    """Store in `factors` Z, eigenvectors of G G^T for the n_redundant smallest eigenvalues; NaN if one is not small."""
     gram = factors + pattern[n_rows] - pattern[0] + n_rows
     Z = gram + n_rows * n_rows
     scratch = Z + n_redundant * n_rows
@@ -185,9 +185,9 @@ def _solve_with_gram(work, n_rows, factor, x):
 
 @compiled
 def solve_along_rows(work, pattern, n, n_rows, n_redundant, factors, x, out):
-    """Solve G G^T y = x; replace x (n_rows) by y, and store -G^T y, the least d with G d = -x, in `out` (n).
+    """Solve G G^T y = x; store -G^T y, the least d with G d = -x, in `out` (n); then replace x (n_rows) by y.
 
-    G: Jacobian with rows scaled to norm 1. First, components of x along vanishing combinations of rows are removed.
+    G: Jacobian with rows scaled to norm 1. First, remove from x its components along vanishing combinations of rows.
     """
     gram = factors + pattern[n_rows] - pattern[0] + n_rows
     Z = gram + n_rows * n_rows
@@ -210,12 +210,12 @@ def solve_least_change(work, pattern, n, n_rows, n_redundant, factors, x, change
 
 MAX_ITERATIONS = 12  # largest number of steps of the Gauss-Newton iteration
 ROUNDING_FACTOR = 64.0  # a constraint holds if its residual is at most this number of rounding errors of its terms
-# displaced positions are projected to find other assemblies: one counts as near if a result differs from its linear
-# prediction (the displacement without its part normal to the constraints) by more than this part of the displacement
+# displaced positions are projected. Another assembly counts as near if a result differs from its linear prediction
+# (the displacement without its part normal to the constraints) by more than this part of the displacement
 MAX_CURVATURE = 0.25
 MIN_EIGENVALUE = 1e-12  # constraints are independent if all eigenvalues of G G^T exceed this (rows of G have norm 1)
 N_WEAKEST_ITERATIONS = 10  # number of inverse iterations for the direction that the constraints determine least
-N_REDUNDANT = 5  # index in `settings` of the number of redundant rows, in place of N_EVALUATIONS
+N_REDUNDANT = 5  # index of the number of redundant rows in `settings`; in this module, it replaces N_EVALUATIONS
 # factors (a, b) of three other guesses, p + a (p - p_0) + b d, where p_0 is the first guess, p its projection onto the
 # constraints, and d the direction that the constraints determine least
 OTHER_GUESSES = ((-2.0, 0.0), (0.0, 1.0), (0.0, -1.0))
@@ -310,7 +310,7 @@ def _gauss_newton(code, settings, control, pattern, moves, work):
                 continue
             for j in range(n):
                 work[(new + j) * LANES + k] += work[(change + j) * LANES + k]
-            # if the constraints already held before the last change, applying it still improves the accuracy
+            # the lane has converged if constraints held before this change, which is applied to improve the accuracy
             if _constraints_hold(work, pattern, n, n_rows, memory, G, new, k):
                 work[at.UNCONVERGED * LANES + k] = 0.0
             else:
@@ -348,7 +348,10 @@ def _project_velocities(code, settings, control, pattern, moves, work):
 
 @compiled
 def _find_weakest_direction(work, pattern, n, n_rows, n_redundant, factors, x, correction, weakest):
-    """Store in `weakest` the direction that constraints determine least; set RUNNING to 0 where they are dependent."""
+    """Store in `weakest` the direction that constraints determine least, with max|entry| as in `correction`.
+
+    Set RUNNING to 0 in lanes where more constraints are dependent than the known redundant ones.
+    """
     scratch = factors + pattern[n_rows] - pattern[0] + n_rows * (1 + n_rows + n_redundant)
     for i in range(n_rows):
         fill_field(work, x + i, 0.5 + (GOLDEN_SECTION * (i + 1)) % 1.0)
