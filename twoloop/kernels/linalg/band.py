@@ -169,7 +169,7 @@ def _scratch_view(numbers, n, n_c, b):
 
 @compiled
 def factor_bordered(w, b, Cq, numbers, pivots, factorize, substitute):
-    """Factor [[B, Cq^T], [Cq, 0]], with banded B in `numbers`, by LAPACK, such as DGBTRF and DGBTRS; return a code."""
+    """Factor [[B, Cq^T], [Cq, 0]], with B in `numbers`, by LAPACK routines such as DGBTRF, DGBTRS; return a code."""
     n_c, n = Cq.shape
     band = lu_band(numbers, n, b)
     exchanges = pivots[: n - n_c].view(np.int32)
@@ -191,7 +191,7 @@ def factor_bordered(w, b, Cq, numbers, pivots, factorize, substitute):
 
 @compiled
 def solve_bordered(w, b, Cq, numbers, pivots, substitute, x):
-    """Replace r, the argument x, by x of [[B, Cq^T], [Cq, 0]] [x; mu] = [r; 0]; use factors from `factor_bordered`."""
+    """Replace x = r by the solution x of [[B, Cq^T], [Cq, 0]] [x; mu] = [r; 0], by factors from `factor_bordered`."""
     n_c, n = Cq.shape
     band, exchanges = lu_band(numbers, n, b), pivots[: n - n_c].view(np.int32)
     call_lapack(w.lapack[substitute], (NO_TRANSPOSE, n, b, b, 1, band, 3 * b + 1, exchanges, x, n))

@@ -49,9 +49,9 @@ def _find_constant_pivot(R, K, columns, row_active, row_sizes, column_sizes):
 
 @compiled
 def _is_pivot_block(R, block_columns, squared_norms, i, k, j, l, max_squares, min_sine_square):
-    """Return True if rows i, k and columns j, l of R meet the limits of a pivot block; single pivot: i == k, j == l.
+    """Return True if rows i, k and columns j, l of R meet both limits of a pivot block; single pivot: i == k, j == l.
 
-    `block_columns`: columns of the entries of rows i and k. `squared_norms`: of the columns of G.
+    `block_columns`: columns of the entries of rows i and k. `squared_norms`: of columns of G. Limits: see MAX_SQUARES.
     """
     total = 0.0
     if i == k:
@@ -153,7 +153,7 @@ def _subtract_multiple(R, K, columns, row_sizes, column_sizes, union, r, j, i):
 
 @compiled
 def _eliminate(R, K, columns, row_active, row_sizes, column_sizes, union, i, k, j, l):
-    """Eliminate a pivot block (rows i, k, columns j, l): solve its rows for its columns, and clear these elsewhere."""
+    """Solve rows i, k of a pivot block for the coordinates of its columns j, l; eliminate these from all other rows."""
     row_active[i] = row_active[k] = 0
     n, is_single = _merge_columns(columns, row_sizes, i, k, union), i == k
     a, b, c, d = R[i, j], R[i, l], R[k, j], R[k, l]

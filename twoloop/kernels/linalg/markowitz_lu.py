@@ -95,25 +95,25 @@ def row_exchanges_of(index):
 
 @merged
 def index_of_upper_begins(r):
-    """Return the offset in `index` of the list that has the index in `values` of the first entry of each row of U."""
+    """Return the offset of a list in `index`: for each row of U, the index of its first entry in `values`."""
     return N_HEAD + 3 * r
 
 
 @merged
 def index_of_upper_ends(r):
-    """Return the offset in `index` of the list that has the index in `values` after the last entry of each row of U."""
+    """Return the offset of a list in `index`: for each row of U, 1 + the index of its last entry in `values`."""
     return N_HEAD + 4 * r
 
 
 @merged
 def index_of_lower_begins(r):
-    """Return the offset in `index` of the list that has the index in `values` of the first entry of each row of L."""
+    """Return the offset of a list in `index`: for each row of L, the index of its first entry in `values`."""
     return N_HEAD + 5 * r
 
 
 @merged
 def index_of_entries(r):
-    """Return the offset in `index` of the list of the row of each entry; the lists of columns and sources follow."""
+    """Return the offset of a list in `index`: for each entry, its row. The lists of columns and of sources follow."""
     return N_HEAD + 6 * r + 1
 
 
@@ -141,7 +141,7 @@ def clear_lists(index, r):
 
 @compiled
 def put_entry(matrix, i, j, number, source):
-    """Add entry (i, j) = `number` to the lists (`source`: index of its initial value); return False if one is full."""
+    """Add entry (i, j) = `number` to the lists (`source`: index of initial values); return False if a list is full."""
     counts, lists, numbers = matrix
     n, m = counts[ROW_SIZE, i], counts[COLUMN_SIZE, j]
     if n == numbers.shape[1] or m == numbers.shape[1]:
@@ -188,7 +188,7 @@ def _choose_pivot(matrix, rows, columns, k):
 
 @merged
 def _exchange(order, position, k, chosen):
-    """Exchange two indices so that `chosen` gets to position k of `order`; return -1, or 1 if it was there already."""
+    """Move `chosen` to position k of `order` by an exchange; return its sign, -1, or 1 if nothing was exchanged."""
     previous, exchanged = position[chosen], order[k]
     order[k], order[previous] = chosen, exchanged
     position[chosen], position[exchanged] = k, previous

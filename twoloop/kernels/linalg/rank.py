@@ -7,7 +7,7 @@ from numba import types
 from twoloop.kernels.data.common import INTEGERS, MATRIX, VECTOR, compiled, f8, i8, kernel, merged
 from twoloop.kernels.linalg.dense import copy_matrix, largest_of, ldl_factor, ldl_solve, ldl_solve_rows
 
-# rounding error of the dot product of two rows, relative to (sum of squares of all entries) * (number of rows)
+# assumed rounding error of the dot product of two rows, relative to (sum of squares of all entries) * (number of rows)
 ROUNDING_OF_SQUARES = 4.0 * 2.0**-52
 # a row is orthogonalised again if the squared norm of its orthogonal part is below this fraction of its squared norm
 REORTHOGONALISE_BELOW = 0.5
@@ -46,7 +46,7 @@ def _orthogonalise(basis, n, remainder, components):
 def select_rows(G, min_sine, basis, factors, kept):
     """Store in `kept` the indices of rows of G, each independent of the rows selected before; return their number.
 
-    A row is independent if the sine of its angle to the selected rows exceeds `min_sine`. Its part orthogonal to these
+    A row is independent if the sine of its angle to their span exceeds `min_sine`. Its part orthogonal to these
     is computed by Gram-Schmidt orthogonalisation, which is repeated if this part is small. On return, the rows of
     `basis` are orthonormal, and the matrix of selected rows is the lower triangle `factors` times `basis`. Both arrays
     have one row for each row that may be independent, and one more for scratch.
@@ -112,7 +112,7 @@ def express_other_rows(rows, order, min_sine, chosen_rows, basis, factors, kept,
     """Return False if the rows order[:n] are dependent; else express other rows as combinations of these.
 
     `order`: indices in `rows`; n: number of rows of `chosen_rows`, which receives the rows order[:n]. Row i of
-    `coefficients` receives those of the combination nearest to row order[n + i]; `norms` receives the norms of `rows`.
+    `coefficients` receives the combination that is nearest to row order[n + i]; `norms` receives the norms of `rows`.
     For the other arguments see `select_rows`.
     """
     n = len(chosen_rows)
@@ -158,7 +158,7 @@ SIMILAR_EIGENVALUES, INDEPENDENT, DEPENDENT = 1e-7, 1e-10, 1e-10
 # the coefficient: the rows are farther from becoming dependent, as at each dead centre of the slider-crank with two
 # rods. The limit exceeds 1, because equal coefficients of magnitude 1 are common, and must not lead to exchanges
 MAX_COEFFICIENT = 1.5
-# if the ratio of two coefficients is at most this, they count as equal, and the first row is exchanged: in symmetrical
+# if the ratio of two coefficients is at most this, they count as equal, and the first one is chosen: in symmetrical
 # mechanisms, rounding would otherwise choose among many equal coefficients, differently at each start
 TIE_RATIO = 1.01
 ZERO_ENTRY = 1e-12  # an entry counts as zero up to this fraction of the largest in its row: the start may be rounded
@@ -228,9 +228,9 @@ def _sort_rows_by_entries(G, order, counts):
 
 @merged
 def _removes_weak_eigenvalue(A, g, scale, x):
-    """Return True if adding scale * g g^T to a matrix with the factors A reduces its number of negative eigenvalues.
+    """Return True if adding scale * g g^T to the mass matrix M removes one of its eigenvalues below the limit b.
 
-    This is so if the determinant changes its sign. `x` is scratch.
+    Then det(M - b I) changes its sign. A contains the factors of M - b I; `x` is scratch.
     """
     for j in range(x.size):
         x[j] = g[j]
@@ -316,7 +316,7 @@ def _exchange_rows(C, is_kept, kept):
 
 @compiled
 def _fill_scaled_products(mass, G, factors, solved, S, sizes):
-    """Store in S the upper triangle of G M^-1 G^T, scaled to a diagonal of 1; return False if M is not definite.
+    """Store in S the upper triangle of G M^-1 G^T, scaled to a diagonal of 1; M not positive definite: return False.
 
     `sizes` receives the factors that scale the rows of G, or 0 for rows of zeros. `factors` and `solved` are scratch.
     """
@@ -439,8 +439,8 @@ def _select_dependent_rows(G, min_sine, basis, factors, coefficients, C, kept, i
 def choose_rows(original_mass, G, min_sine, weak_ratio, bounds, workspace, chosen):
     """Choose the independent rows of G, and rows g for which M + sum s g g^T is invertible (M: `original_mass`).
 
-    Rows of G are selected as in `select_rows` with `min_sine`, then exchanged as in `_exchange_rows`. Rows are added to
-    M if M has eigenvalues below `weak_ratio` times the largest; weak_ratio = 0: no rows are added. `chosen`, of
+    Rows of G are selected as in `select_rows` with `min_sine`, then exchanged as in `_exchange_rows`. Terms s g g^T are
+    added to M if it has eigenvalues below `weak_ratio` times the largest; weak_ratio = 0: none are added. `chosen`, of
     2 + 3 n_rows numbers, receives the number of independent rows, the number of added rows, and the indices of both in
     two lists of length n_rows. `workspace` is scratch, but workspace[0] receives s. Return the result of
     `_first_bound_below_pivots`, or a code: STAYS_SINGULAR or NOT_DEFINITE. See generate/elimination.py.

@@ -263,7 +263,7 @@ def _largest_entry(A):
 
 @compiled
 def _write_augmented_program(w):
-    """Store the program that factors the augmented matrix [M G^T; G 0] in w.index_a; return a code (`choose_order`)."""
+    """Store the program that factors the augmented matrix [M G^T; G 0] in w.index_a; return `choose_order`'s code."""
     n, rows, index, values = w.Q.size, w.rows_v, w.index_a, w.values_a
     update_pattern(w.M, w.mass_pattern)
     clear_lists(index, n + rows.size)
@@ -286,7 +286,7 @@ def _write_augmented_program(w):
 
 @compiled
 def _run_augmented_program(w):
-    """Store the factors of the augmented matrix in w.values_a; return False if a pivot of the program is too small."""
+    """Factor the augmented matrix in w.values_a; return False if a pivot is 0 or not finite, or a multiplier large."""
     index, values, scale, first_of_mass = w.index_a, w.values_a, w.mass_scale, w.entries.size
     source = index_of_entries(index[at.SIZE]) + 2 * index[at.N_SLOTS]
     for s in range(index[at.N_SLOTS]):

@@ -3,8 +3,8 @@
 M is the mass matrix, and G the constraint Jacobian. An independent row of G has a negative pivot: minus the squared
 norm of the part of the row that is orthogonal to previous rows, in the metric of M^-1. The squared norm of the row
 itself is the sum of contributions of the bodies. The ratio of the two squared norms is the squared sine of the angle
-between the row and the previous rows. For a redundant row, 0 replaces 1 / pivot: the row does not influence the
-solution, and the program stays the same. If the smallest squared sine is 10^-k, solutions lose k digits, which
+between the row and the span of previous rows. For a redundant row, 0 replaces 1 / pivot: the row does not influence
+the solution, and the program stays the same. If the smallest squared sine is 10^-k, solutions lose k digits, which
 iterative refinement with M and G recovers.
 
 The matrix M of a body may be singular, as it is with four Euler parameters. Then M + s g g^T replaces M for each row g
@@ -80,7 +80,7 @@ def fill_saddle_matrix(program, mass, jacobian, values, stiffness, scratch):
 def factor(program, is_independent, values, sizes, min_sine_square):
     """Replace the matrix in `values` by its factors, with 1/pivot on the diagonal; return the smallest squared sine.
 
-    The sine is that of the angle between a row of G and the previous rows. Its square is -pivot / (squared norm of the
+    It belongs to the angle between a row of G and the span of previous rows, and equals -pivot / (squared norm of the
     row); the squared norms are stored in `sizes`. On entry, `is_independent` is 0 for rows that count as redundant. It
     becomes 0 for rows whose squared sine is at most `min_sine_square`. Rows with 0 do not affect the result. If M is
     not positive definite on the velocities that the rows allow, return NOT_DEFINITE.

@@ -232,7 +232,7 @@ def _minimum_degree_order(
     while heap:
         degree_on_heap, node = heapq.heappop(heap)
         if is_eliminated[node] or degree_on_heap != degree(node):
-            continue  # this entry of the heap is outdated: a newer one replaces it
+            continue  # this entry of the heap is outdated, and a newer one is also in the heap
         if node < n_joints and not supports.can_eliminate(node):
             continue  # the joint must wait for the elimination of a hub beside it, which puts it on the heap again
         is_eliminated[node] = True
@@ -408,10 +408,7 @@ def pivot_order_of(program):
 
 @inlined
 def factor_columns_of(program):
-    """Return two arrays: index of the first entry of each column of L, then the number of entries; row of each entry.
-
-    Rows are numbered in the order of elimination.
-    """
+    """Return for each column of L the number of its first entry (last: of entries); and, for each entry, its row."""
     begin = N_HEAD + program[N_PIVOTS]
     middle = begin + program[N_PIVOTS] + 1
     return program[begin:middle], program[middle : middle + program[N_OFF_DIAGONAL]]
