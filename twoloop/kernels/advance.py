@@ -79,14 +79,14 @@ def start(f, w, t, state):
         code = find_tangents(f, w, t, q)
     if code == DONE:
         code = accelerations(f, w, t, q, v, state[2 * n : 3 * n], state[3 * n :])
-    if code == DONE and f.gamma_given == 0:  # repeat: errors of Gamma depend on its size, now known
+    if code == DONE and f.gamma_given == 0:  # repeat: the error test of Gamma needs its size, now known
         code = accelerations(f, w, t, q, v, state[2 * n : 3 * n], state[3 * n :])
     return code
 
 
 @merged
 def _locate_rate_jump(f, w, t, size, tolerances, accepted, state, new_state):
-    """Return JUMP, RAMP or SMOOTH for C_t and b (of A v + b = 0) in a step; the jump's or ramp's begin and end (s)."""
+    """Return JUMP, RAMP or SMOOTH for C_t and b in a step (`accepted` or not), and the ends (s) of the jump or ramp."""
     n = w.Q.size
     q, v = state[:n], state[n : 2 * n]
     if not accepted:
@@ -125,7 +125,7 @@ def _attempt_step(f, w, options, memory, tolerances, control, clock, t, size, cr
 
 @merged
 def _must_repeat_at_jump(f, w, tolerances, control, clock, t, size, accepted, state, new_state):
-    """Return True if a step must be repeated because C_t or b jumps, or has a steep ramp, within the step.
+    """Return True if a step (`accepted` or not) must be repeated because C_t or b jumps in it, or has a steep ramp.
 
     For a jump, store the interval that contains it in clock[JUMP_FROM] and clock[JUMP_TO]. For a ramp, store the next
     step size in clock[H_NEXT].
@@ -270,7 +270,7 @@ def advance(
         target = outputs[int(clock[at.NEXT_OUTPUT])]
         goal = min(target, clock[at.JUMP_TO] if jumps else clock[at.JUMP_FROM])
         h = control[at.FIXED_STEP] if fixed_size else min(clock[at.H_NEXT], clock[at.H_LIMIT], control[at.MAX_STEP])
-        n_grid_steps = 1.0  # fixed step size: number (0 or 1) of intervals of the time grid that this step completes
+        n_grid_steps = 1.0  # for steps of fixed size: number (0 or 1) of grid times that this step reaches
         if fixed_size:
             size, n_grid_steps, reaches_goal = size_on_grid(clock, t, h, target, goal)
         else:

@@ -324,7 +324,7 @@ def _restore_start(b):
 # indices in `last_start`. N_EQUAL: number of successive runs from the last start, at most 2. START: index of the first
 # number of the last start, [t, t1, q, v]
 N_EQUAL, START = 0, 1
-NEVER, IS_SAVED = 0.0, 2.0  # N_EQUAL if no run could begin at the last start; if `saved` has data of this start
+NEVER, IS_SAVED = 0.0, 2.0  # values of N_EQUAL: no run could begin at the last start; `saved` has data of this start
 
 
 @exact

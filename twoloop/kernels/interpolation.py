@@ -49,8 +49,8 @@ def _divided_differences(t, states, lo, hi, i, h, column, order, z, c):
 
     Each of the n columns of `states` from index `column` on has a polynomial; it is zero at time t[i], because row i is
     subtracted. The next n columns are first derivatives, and the next n second derivatives: polynomials interpolate
-    values and order - 1 derivatives. Store the nodes of Newton's form in z, in the variable (time - t[i]) / h, and the
-    coefficients in c.
+    values and order - 1 derivatives. Store the coefficients of Newton's form in c, and the interpolated times in z, as
+    (time - t[i]) / h.
     """
     n = c.shape[1]
     n_coefficients = (hi - lo + 1) * order
@@ -76,7 +76,7 @@ def _divided_differences(t, states, lo, hi, i, h, column, order, z, c):
 def _evaluate_polynomials(states, i, kind, h, s, z, c, size, z_v, c_v, size_v, q, v):
     """Store in q and v the values of the polynomials of an interval at the time t[i] + s h; h: duration.
 
-    (z, c, size): nodes, coefficients and number of coefficients of the polynomials of q. If `kind` is SEPARATE,
+    (z, c, size): interpolated times, coefficients and their number, for the polynomials of q. If `kind` is SEPARATE,
     (z_v, c_v, size_v) are the same for v; otherwise v is the derivative of the polynomials of q.
     """
     n = q.size
@@ -107,7 +107,7 @@ def _kind_by_duration(kind, tolerances, h, states, i):
 
 @inlined
 def _fit_polynomials(tolerances, t, states, group, z_q, c_q, z_v, c_v):
-    """Store the polynomials of an interval: nodes z_q and coefficients c_q for q; z_v and c_v for v if it has its own.
+    """Store the polynomials of an interval: times z_q and coefficients c_q for q; z_v and c_v for v if it has its own.
 
     `group`: row of the table of intervals (data/indices.py). Return the kind and duration (s) of the interval; indices
     of the first and last interpolated state; number of values (with derivatives) per state; numbers of coefficients.
@@ -252,9 +252,9 @@ def estimate_errors(f, w, tolerance, tolerances, t, states, groups, z, coefficie
 
     The estimate is the first of these that applies:
     - 0 if the polynomials do not interpolate accelerations (kinds SEPARATE and VELOCITIES), and have more than two
-      nodes at about equal distances, none of them inside the interval;
-    - if there are more than two nodes: how much the last node changes the polynomials. This applies if it is at most 1,
-      or if the kind is VELOCITIES, because the accelerations then contain the noise of stiff modes;
+      interpolated states at about equal distances, none of them inside the interval;
+    - if there are more than two of these: how much the last one changes the polynomials. This applies if it is at most
+      1, or if the kind is VELOCITIES, because the accelerations then contain the noise of stiff modes;
     - the residual of the polynomials in the constraints and the equations of motion at CHECKED_FRACTIONS. A residual of
       accelerations, times h / (number of coefficients), counts as an error of velocities.
     """

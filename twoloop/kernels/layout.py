@@ -31,7 +31,7 @@ class FixedOrderSizes(NamedTuple):
 
 # arguments of _create_layout: numbers of coordinates, of rows of C_q, of rows of A (non-holonomic); ranks of C_q and of
 # [C_q; A]; True if accelerations follow from T^T M T (T: null space of the constraints); True if they follow from the
-# augmented matrix; number of nodes of traced programs; FixedOrderSizes or None; length of the array `matrices`
+# augmented matrix; number of operations of traced programs; FixedOrderSizes or None; length of the array `matrices`
 Sizes = tuple[int, int, int, int, int, bool, bool, int, FixedOrderSizes | None, int]
 ArrayRanges = list[tuple[str, int, int, tuple[int, ...]]]  # for each array: name, first offset, end, shape
 

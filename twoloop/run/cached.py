@@ -80,8 +80,8 @@ N_FIRST_CHUNKS = 4
 N_SKIPPED_CALLS = 16  # after an exception in a callback, this number of calls do not use the cached integrator
 STEP_FIELDS = (*STEP_ARRAYS, "stats")  # fields of a result that are computed from the array of steps
 NON_STEP_DEFAULTS = {name: value for name, value in DEFAULTS.items() if name not in STEP_FIELDS}
-SHORT_RUN = 1e-3  # if the last run took less CPU time (s), elapsed time is measured, because it is read faster
-HARMLESS = 0.01  # v0 is accepted if projecting it onto the constraints changes it by at most this many tolerances
+SHORT_RUN = 1e-3  # if the last run took less CPU time (s) than this, elapsed time is measured: that is faster
+HARMLESS = 0.01  # v0 is accepted if projecting it onto the constraints changes it by at most this number of tolerances
 REACHED_END = Status.REACHED_END  # a global name is read faster than a member of an Enum
 
 
@@ -126,8 +126,8 @@ class CachedIntegrator:
         self.evaluation, self.loops, self.code, self.skips = StartEvaluation(checked), cached_run(), code, 0
         self.arrays, self.callbacks = arrays_of(run, self.evaluation, code, definite, options, n_attempts), checked.kit
         self._start_and_advance = entry_point(self.loops.start_and_advance)
-        # indices in `arrays.block`, in which the report comes before the states. states_begin: first number of the
-        # states. one_state_begin: first number of the report if there is one state and no step, else it begins earlier
+        # indices in `arrays.block`, where the report ends at states_begin, the first number of the states. The report
+        # on one state and no step begins at one_state_begin; reports on more states and steps begin earlier
         self.states_begin, self.width = self.arrays.report.size, len(run.state)
         self.one_state_begin = self.states_begin - self.loops.N_HEAD - 1
         self.loop_used = False  # whether `IntegrationLoop` may have changed attributes of `run` other than arrays
@@ -217,11 +217,11 @@ class CachedIntegrator:
         fields["later"] = partial(
             _deferred_field, data, timed_states, self.run_fields, self.cpu_time, system, t1, self.options
         )
-        region.count_run()  # `IntegrationLoop` counts the runs that it continues
+        region.count_run()  # count this run here; `IntegrationLoop` counts only the runs that it continues
         return fields
 
     def _pivots_suit_start(self, t0: float, q0: Array) -> bool:
-        """Return whether code was generated for the pivots chosen at (t0, q0); `arrays` has M and constraint rows."""
+        """Return whether the generated code suits (t0, q0), where M and the rows of C_q and A are those in `arrays`."""
         system, arrays = self.evaluation.system, self.arrays
         system.remember_at("mass and rows", (t0, q0.tobytes()), (arrays.mass.copy(), arrays.rows.copy()))
         return self.code is not None and self.code.is_valid_from(system, t0, q0)
@@ -308,12 +308,12 @@ class CachedIntegrator:
         """Restore the attributes of the run, other than arrays, that `IntegrationLoop` may have changed."""
         run, self.loop_used = self.run, False
         if run.plan is self.attributes_at_start["plan"] and not run.substituted and run.kit.flags[FORM] == self.form:
-            # the plan has not changed. The kit may have: if `IntegrationLoop` has loaded a step, the new kit calls it
+            # keep the present kit: if `IntegrationLoop` has loaded a step of this plan, only this kit calls it
             self.attributes_at_start["kit"] = run.kit
         vars(run).update(self.attributes_at_start, crossings=[], jumps=[], sizes_to_try=[], substituted=False)
 
     def _callbacks_are_correct(self, t: Array, rows: Array, t1: float, is_inside: bool, is_due: bool) -> bool:
-        """Return whether callbacks are correct at states of the run, see `check_callbacks_along_run`."""
+        """Return whether callbacks are correct at `rows` (states at times t); see `check_callbacks_along_run`."""
         n = 2 * self.run.system.n_q
 
         def states(all_states: bool) -> Array:
@@ -341,7 +341,7 @@ def fields_of(
 def _deferred_field(
     data: Array,  # copy of the report, times, steps and states of a run
     timed_states: tuple[Array, Array] | None,  # output times and states; None: all steps
-    run_fields: tuple[int, NDArray[np.int64], bool],
+    run_fields: tuple[int, NDArray[np.int64], bool],  # rank; redundant rows; whether steps called generated code
     cpu_time: float,
     system: ConstrainedSystem,
     t1: float,
@@ -365,7 +365,7 @@ def _deferred_field(
     return NON_STEP_DEFAULTS | state_fields(system.n_q, t, rows) | fields | options.metadata
 
 
-RECHECK_PIVOT = 0.1  # `set_up` checks a start if its smallest pivot is below this fraction of that at the first start
+RECHECK_PIVOT = 0.1  # if smallest pivot at a start / smallest pivot at the first start is lower, `set_up` checks it
 
 
 def arrays_of(
@@ -436,20 +436,20 @@ def arrays_of(
 
 
 def _choice_as_array(choice: PivotChoice | None) -> tuple[NDArray[np.int64], float]:
-    """Return a choice of pivots as integers for kernels, and the factor s of the terms s g^T g that it adds to M.
+    """Return a choice of pivots as an array of integers for kernels (empty if `choice` is None), and a factor s.
 
-    g: constraint rows that make a singular M definite; s = 1 if none are needed.
+    If M is singular, terms s g^T g with some constraint rows g make it definite; s = 1 if M needs no such terms.
     """
     if choice is None:
         return np.zeros(0, dtype=np.int64), 1.0
-    # OF_PYTHON: only Python can repeat a refined choice, for which it may try several ways to add rows to M
+    # kernels cannot repeat a refined choice, for which Python may try several sets of such rows: OF_PYTHON
     index = cached_run().OF_PYTHON if choice.is_refined else int(np.searchsorted(-MIN_PIVOTS, -choice.min_pivot))
     numbers = index, len(choice.rows), len(choice.added_rows), *choice.rows, *choice.added_rows
     return np.array(numbers, dtype=np.int64), (*choice.scales, 1.0)[0]
 
 
 # limits of a system's cache. MAX_OPTIONS: largest number of sets of options. MAX_WORKSPACE: a run with more floats in
-# its workspace is not cached. MAX_ENTRIES: limit of entries for equal options; their starts need different code
+# its workspace is not cached. MAX_ENTRIES: largest number of entries for the same options, but different starts
 MAX_OPTIONS, MAX_WORKSPACE, MAX_ENTRIES = 16, 150_000, 3
 
 
@@ -466,7 +466,7 @@ class CacheEntry(NamedTuple):
     shared: SharedSetup | None = None  # setup shared with systems that differ only in their parameters
 
 
-# empty cache of a system: last start, entries by options, id() of the last run's new code (None: no new code)
+# a system's cache before its first run: last start; entries by options; id() of the code generated for the last run
 EMPTY_CACHE: tuple[Any, dict[Any, tuple[CacheEntry, ...]], int | None] = (None, {}, None)
 
 
@@ -524,7 +524,7 @@ def set_up(
     A run is cached if twoloop provides the method, callbacks are compiled, and callbacks agree with their traces. Raise
     TypeError or ValueError if the start is refused, the method cannot run the system, or code cannot be generated.
     """
-    if system.called_in_python:  # functions called in Python may depend on variables that change
+    if system.called_in_python:  # cache no run: functions called in Python may depend on variables that change
         return _new_run(system, t0, t1, q0, v0, options)[0], None
     start, key = (t0, q0.tobytes(), v0.tobytes()), options.key
     last_start, runs, last_code = system.derived.get("runs", EMPTY_CACHE)
@@ -564,8 +564,8 @@ def _make_cache_entry(run: Run, code: GeneratedCode | None, t1: float, options: 
         run.fixed_order is None and is_final and (definite or not sparse_factors_pay(system, run.kit.flags))
     )
     start = t0, q0.tobytes(), v0.tobytes()
-    can_start = for_other_starts and not run.start_warning and not system.called_in_python  # by compiled code
-    idle: list[CachedIntegrator] | None = [] if can_start else None
+    can_start = for_other_starts and not run.start_warning and not system.called_in_python
+    idle: list[CachedIntegrator] | None = [] if can_start else None  # None: compiled code cannot start this run
     return CacheEntry(run.copy(), start, t1, code, definite, for_other_starts, idle)
 
 
@@ -594,7 +594,7 @@ def _share_setup(system: ConstrainedSystem, run: Run, code: GeneratedCode | None
 def _copy_for_start(
     entry: CacheEntry, system: ConstrainedSystem, t0: float, t1: float, q0: Array, v0: Array, options: Options
 ) -> Run | None:
-    """Return a copy of a cached run at another start; None if this start needs other code or linear algebra."""
+    """Return a copy of a cached run at another start; None if the run's generated code or kit does not suit it."""
     _check_start(system, t0, q0, v0, options)
     if entry.code is not None and not entry.code.is_valid_from(system, t0, q0):
         return None
@@ -607,7 +607,7 @@ def _copy_for_start(
 def _new_run(
     system: ConstrainedSystem, t0: float, t1: float, q0: Array, v0: Array, options: Options
 ) -> tuple[Run, GeneratedCode | None]:
-    """Check a start, derive callbacks, generate code, choose a plan; return a new run at the start, and the code."""
+    """Check a start, derive callbacks, generate code, choose a plan; return a new run and the generated code."""
     has_fixed_step, original, new = options.step_size is not None, system, not system.checked
     if new:
         load_checked_bounds(system)

@@ -46,11 +46,11 @@ class StateTable(NamedTuple):
 
     t: Array
     states: Array
-    kinds: NDArray[np.int64]  # codes of the data that their polynomials interpolate, see kernels/data/indices.py
+    kinds: NDArray[np.int64]  # kinds of the intervals: codes such as SEPARATE, see kernels/data/indices.py
 
 
 def ranks_at(system: ConstrainedSystem, t: float, q: Array, v: Array, rtol: float) -> tuple[int, int]:
-    """Return the rank of C_q and the rank of all constraint rows at a state, as `workspace` expects them."""
+    """Return the rank of C_q and the rank of [C_q; A] at a state: the argument `ranks` of `workspace`."""
     from twoloop.kernels import advance
 
     kit = make_kit(system, t, q)
@@ -140,7 +140,7 @@ class Interpolator:
         self._create_workspace()
 
     def _allocate_scratch(self) -> None:
-        """Allocate scratch arrays for the nodes and coefficients of two polynomials."""
+        """Allocate scratch arrays for the interpolated times and the coefficients of two polynomials."""
         n_nodes = 3 * max(indices.WINDOW, self.parts + 1)
         n = self.system.n_q
         self.nodes, self.scratch, self.rows = np.zeros(2 * n_nodes), np.zeros((2 * n_nodes, n)), np.zeros((3, 2 * n))
@@ -251,9 +251,9 @@ class Interpolator:
         return out
 
     def _repair_interval(self, table: StateTable, interval: Integers, smallest: float) -> None:
-        """Try other nodes for the polynomial of an interval; cache those with the least residual, if below `smallest`.
+        """Let other states determine an interval's polynomial; cache those with the least residual, if < `smallest`.
 
-        Nodes to try: states in a crossing step; the ends of N_REPAIR_STEPS steps; only the two ends of the interval.
+        Sets of states to try: states in a crossing step; ends of N_REPAIR_STEPS steps; the two ends of the interval.
         """
         i, kind = int(interval[indices.FIRST_OWN]), int(interval[indices.KIND])
         begin = float(table.t[i])
@@ -299,7 +299,7 @@ class Interpolator:
         n, options = self.system.n_q, crossing_plan(self.system.n_q).options
         times = np.linspace(table.t[i], table.t[i + 1], self.parts + 1)
         states = np.array([state_at(memory, options, t) for t in times])
-        # at both ends, q and v are those of the table, but not the accelerations: rounding errors may dominate them
+        # at both ends, use q and v of the table, but not its accelerations, in which rounding errors may dominate
         states[[0, -1], : 2 * n] = table.states[i : i + 2, : 2 * n]
         return times, states
 
@@ -398,7 +398,7 @@ class Interpolator:
             failures = fill(self.kit, self.work, times, states, out)
         self.failures, n = failures, self.system.n_q
         if failures > 0:
-            # at a start in a singular position, a is known; lam is unknown (the run has warned of this)
+            # at a start in a singular position, store the known a; lam stays NaN (the run has warned of this)
             is_missing = np.isnan(out[:, :n]).any(axis=1)
             out[is_missing & (times == self.arguments[1]), :n] = self.arguments[2][2 * n :]
             n_missing = int(np.isnan(out[:, :n]).any(axis=1).sum())
@@ -418,7 +418,7 @@ def _interval_rows(table: StateTable, numbers: Integers) -> Integers:
     rows[:, indices.FIRST_OWN], rows[:, indices.LAST_OWN] = numbers, numbers + 1
     rows[:, indices.KIND] = table.kinds[numbers]
     rows[:, indices.HIGH] = len(table.t) - 1
-    # polynomials across a singular position use no states before the crossing steps: rounding errors may be large there
+    # polynomials across a singular position use no states before crossing steps: their rounding errors may be large
     is_crossing = np.append(False, table.kinds == indices.ACROSS)
     (crossing_starts,) = (is_crossing[1:] & ~is_crossing[:-1]).nonzero()
     if crossing_starts.size:
@@ -468,7 +468,7 @@ class OutputInterpolation:
             return None
         a_and_lam = np.full((len(times), len(self.run.state) - rows.shape[1]), np.nan)
         interpolator.fill_accelerations(times, rows, a_and_lam)
-        if interpolator.fixed_order is not None or interpolator.repair_plans:  # its workspace may not suit another run
+        if interpolator.fixed_order is not None or interpolator.repair_plans:  # its workspace suits this run only
             self._interpolator = None
         return np.concatenate([rows, a_and_lam], axis=1) if interpolator.failures == 0 else None
 
@@ -503,7 +503,7 @@ class DenseState:
         self.q, self.v = self._columns_by_time(rows[:, :n]), self._columns_by_time(rows[:, n:])
 
     def _columns_by_time(self, rows: Array) -> Array:
-        """Return `rows` (in ascending order of time) as columns in the order of `t`; for a scalar t, as a vector."""
+        """Return `rows` (ascending times) as columns in the order of `self.t`; if that is a scalar, return one row."""
         columns = np.empty(rows.shape[::-1])
         columns[:, self._order] = rows.T
         return columns if np.ndim(self.t) else columns[:, 0]
@@ -540,7 +540,7 @@ class DenseSolution:
     Some steps are too long for such polynomials: steps of `RungeKutta` of order 6 and more (with Newton's method, of
     order 7 and more), of `Taylor` and of `Lobatto16`, also within `auto`. Each such step is divided into 2 to 6 equal
     steps of the method when a time within it is first evaluated; to divide all steps costs about as much as the run. If
-    leaving out the last node changes a polynomial by more than the tolerances, the constraints and equations of motion
+    leaving out the last state changes a polynomial by more than the tolerances, the constraints and equations of motion
     are evaluated at two times in the interval. The polynomial may violate them beside a singular position or a jump of
     a force. Then three other polynomials are tried: through states of a step across the position, through ends of four
     steps of `DOP853` (after Newton's method: of a Radau method), and through the ends of the interval. The statistics

@@ -57,7 +57,7 @@ def warn_of_missed_changes(run: Run) -> str:
 Array = NDArray[np.float64]
 
 N_CORRECTIONS = 3  # number of Newton steps that reduce errors of positions from the tolerances to rounding
-# singular values count as zero (because of a redundant row) up to this fraction of the largest singular value
+# in least-squares solutions, singular values up to this fraction of the largest count as zero (redundant rows)
 NEGLIGIBLE_RATIO = 1e-12
 MAX_RESIDUAL = 1e-8  # largest residual of the equations for v after a jump, relative to their right-hand side
 
@@ -65,7 +65,7 @@ MAX_RESIDUAL = 1e-8  # largest residual of the equations for v after a jump, rel
 def state_after_jump(system: ConstrainedSystem, t: float, q: Array, v: Array) -> Array | None:
     """Return the state [q, v] right after a jump of C_t or b at t; None if no velocities satisfy the constraints.
 
-    Solve M (v+ - v) + G^T p = 0, G v+ + (C_t, b) = 0: of all allowed velocities, v+ is nearest to v in the metric of M.
+    Solve M (v+ - v) + G^T p = 0 and G v+ + (C_t, b) = 0 for the velocities after the jump, v+, and the impulses p.
     """
     q = corrected_positions(system, t, q)
     equations, norms, largest = scaled_equations(system, t, q)
@@ -84,7 +84,7 @@ def corrected_positions(system: ConstrainedSystem, t: float, q: Array) -> Array:
 
 
 def scaled_equations(system: ConstrainedSystem, t: float, q: Array) -> tuple[Array, Array, float]:
-    """Return [M G^T; G 0] with each row of G scaled to norm max|M|, the original norms of the rows, and max|M|."""
+    """Return three values: the matrix [M G^T; G 0], rows of G scaled to norm max|M|; their original norms; max|M|."""
     mass, rows = system.mass(t, q), system.rows(t, q)
     norms, largest = np.linalg.norm(rows, axis=1), float(np.abs(mass).max())
     norms[norms == 0.0] = 1.0  # rows of zeros are not scaled
@@ -96,14 +96,14 @@ def scaled_equations(system: ConstrainedSystem, t: float, q: Array) -> tuple[Arr
 # before the position or too near it; smaller sizes, if the error is too large or a node is at the position
 SIZE_RATIOS = (1.0, *(1.2**k for k in range(1, 12)), *(0.85**k for k in range(1, 28)))
 LARGEST_RATIO = max(SIZE_RATIOS)
-# a run that began beside a singular position has taken short steps only: its first steps, of together less than
-# FIRST_STEPS times the longest of the last steps, show no suitable size, and much larger sizes are tried, too
+# a run that is still shorter than FIRST_STEPS times its longest recent step may have begun beside a singular position.
+# Its steps are then too short to suggest a size across the position, so much larger sizes are tried, too
 FIRST_STEPS = 30.0
 LARGE_RATIOS = tuple(1.2**k for k in range(12, 30))
 # "distance" of a state from a singular position: smallest pivot of C_q, relative to the largest such pivot of the run.
 # The base, the state at which the polynomial across the position begins, should have at least the distance FAR_BEFORE
 FAR_BEFORE = 0.2
-# evaluations may be GAP_FACTOR times as far apart as usual, or arbitrarily far if no force can be short
+# factors of wider limits: on tolerances, and on the time between evaluations (unlimited if no force can be short)
 TOLERANCE_FACTOR, GAP_FACTOR = 10.0, 4.0
 NODE_DISTANCES = 1.0, 0.5, 0.25  # values of Limits.node_distance that are tried in turn
 
@@ -114,8 +114,8 @@ class Limits(NamedTuple):
     has_wide_gaps: bool  # whether the limit of the time between evaluations is multiplied by GAP_FACTOR
     may_approach: bool  # whether steps may end before the position
     tolerance_factor: float  # factor on the tolerances
-    # factor on the distance from the position below which nodes are left out. Nearer nodes have larger rounding errors,
-    # which the error estimate shows; but if a motion is slow near the position, few nodes are farther
+    # nodes nearer to the position than this factor times the usual limit are left out, because their rounding errors
+    # (which the error estimate shows) are larger. If a motion is slow near the position, few nodes are farther away
     node_distance: float
 
 
@@ -133,7 +133,7 @@ MIN_DISTANCE_RATIO = 0.5
 
 
 def requires_crossing(run: Run, code: int) -> bool:
-    """Return whether `code`, which `advance` returned, requires steps across a singular position."""
+    """Return whether `code`, which `advance` returned, requires steps across a singular position (crossing steps)."""
     a, notes = run.a, run.work.notes
     if code == a.SWITCH_METHOD:
         from twoloop.kernels.steps.lobatto_step import TIGHT_TOLERANCE
@@ -147,7 +147,7 @@ def switch_method(run: Run) -> None:
     """Replace a run's plan, whose steps fail or are unsuitable, by its substitute, and try the same step size again."""
     substitute = run.plan.substitute
     assert substitute is not None
-    run.plan, run.memory = substitute.fresh(), substitute.memory  # `run.memory` never changes, and needs no copy
+    run.plan, run.memory = substitute.fresh(), substitute.memory  # `run.memory` holds initial values, and never changes
     renew_kit(run)
     run.substituted = True
     run.write_step_control(run.plan)
@@ -194,7 +194,7 @@ def cross_singularity(run: Run, past: list[TimedState]) -> tuple[Plan, Array]:
     control[: a.N_RULE] = plan.rule
     control[a.SYMMETRIC], control[a.MAY_CROSS], control[a.MAX_ATTEMPTS] = 0.0, 0.0, 1.0
     control[a.MAY_SWITCH] = control[a.TAKES_MANY] = 0.0
-    run.piece_ends = []  # not empty if the last run of a cached integrator ended within a polynomial
+    run.piece_ends = []  # forget those of the last run, if a cached integrator reuses `run`
     if control[a.FIXED_STEP] == 0.0:
         control[a.MAX_EVALUATION_GAP] = 1.0 if run.forces_may_be_steep else NODE_GAP / (1.0 - BACKWARD_FRACTION)
     clock[a.LIMIT_AGE] = 0.0
@@ -203,7 +203,7 @@ def cross_singularity(run: Run, past: list[TimedState]) -> tuple[Plan, Array]:
 
 
 def _limits(run: Run) -> list[Limits]:
-    """Return the limits of steps across a singular position to try, in this order."""
+    """Return all `Limits` of steps across a singular position, in the order in which they are tried."""
     if run.control[run.a.FIXED_STEP] > 0.0:
         return [Limits(False, True, 1.0, 1.0)]
     loose = TOLERANCE_FACTOR
@@ -214,7 +214,7 @@ def _limits(run: Run) -> list[Limits]:
 
 
 def _is_near_start(run: Run) -> bool:
-    """Return whether the run has only taken its first steps, whose sizes show little."""
+    """Return whether the run is so far shorter than FIRST_STEPS times its longest recent step."""
     a, clock = run.a, run.clock
     return bool(clock[a.T] - clock[a.T_START] < FIRST_STEPS * clock[a.H_LONG])
 
@@ -278,9 +278,9 @@ def _find_base_state(run: Run, past: list[TimedState]) -> tuple[TimedState | Non
 
 
 def sizes_across(first_size: float, allowed: float, near_start: bool = False) -> list[float]:
-    """Return step sizes (s) to try across a singular position, at most `allowed`, relative to `first_size`.
+    """Return the step sizes (s), at most `allowed`, to be tried in turn across a singular position.
 
-    They are `first_size` times SIZE_RATIOS, and `near_start` also times LARGE_RATIOS.
+    They are `first_size` times SIZE_RATIOS; if `near_start`, also `first_size` times LARGE_RATIOS.
     """
     sizes = [first_size * ratio for ratio in (SIZE_RATIOS + LARGE_RATIOS if near_start else SIZE_RATIOS)]
     return [min(first_size, allowed), *(size for size in sizes[1:] if size < allowed)]
@@ -323,7 +323,7 @@ def handle_crossing(run: Run, plan: Plan, control: Array, code: int, n_accepted:
             clock[a.H_NEXT], clock[a.H_LIMIT] = run.piece_ends[0] - clock[a.T], np.inf
             return plan, control, a.PAUSED
     run.piece_ends, stored[kernels.END] = [], -np.inf
-    at_singular_start = run.starts_singular and clock[a.T] == run.t0  # there, no choice of dependent coordinates works
+    at_singular_start = run.starts_singular and clock[a.T] == run.t0  # code RANK_LOST is normal here
     if at_singular_start and code == a.RANK_LOST:
         code = a.PAUSED
     if n_accepted > 0:  # the whole polynomial counts as one step

@@ -107,7 +107,7 @@ class Interrupts:
         """
         if self.handlers is None and raised_by_handler(error):
             return False
-        self.install_handlers()  # a signal may arrive here: then a user's handler, or `_on_signal`, may raise
+        self.install_handlers()  # raises if a signal arrives here, and a user's handler or `_on_signal` raises
         return self._is_installed and self.n_signals <= MAX_STORED_SIGNALS
 
     def restore_handlers(self) -> None:
@@ -149,8 +149,8 @@ CHUNK_TO_EVENT = 16  # attempted steps in a chunk if an event may end the run, b
 CHUNK_TIME = 0.05
 # statuses whose message may say that stability limited the steps
 STATUSES_WITH_STIFFNESS_NOTE = {Status.REACHED_END, Status.EVENT, Status.MAX_STEPS, Status.TIME_LIMIT, Status.STAGNATED}
-# a crossing step (across a singular position) begins its polynomial at a past state: one of the last N_RECENT states,
-# or of the last N_RECENT ends of long steps. It searches N_LAST_STATES states, because many steps may be short there
+# the polynomial across a singular position may begin at one of the last N_RECENT states, or at one of the last
+# N_RECENT ends of long steps. As many steps may be short, these ends are searched for among N_LAST_STATES states
 N_RECENT, N_LAST_STATES = 16, 256
 CROSSING_OVERSHOOT = 100.0  # a crossing step may end beyond t1 by at most this multiple of the run's duration
 NO_KINDS = np.zeros(0, dtype=np.int64)  # kinds of intervals if no states between steps are requested
@@ -205,7 +205,7 @@ class IntegrationLoop:
         if self.request.store.append_only:
             self._store_step_fields()
         self.n_filled = np.zeros(2, dtype=np.int64)
-        may_end_before_t1 = has_terminal_event or time_limit is not None  # then t1 may be an upper bound
+        may_end_before_t1 = has_terminal_event or time_limit is not None  # then t1 may be very large
         self.stall_detector = StallDetector(run.t0, np.inf if may_end_before_t1 else MAX_STEPS_LEFT)
         self.stiffness_monitor = StiffnessMonitor(run.plan)
         self.sample = Sample(run.t0, self.start, 2 * run.system.n_q)
@@ -233,7 +233,7 @@ class IntegrationLoop:
             self._take_chunk(buffers)
             n_rows, n_steps = self.n_filled.tolist()
             t, rows, steps = buffers[0][:n_rows], buffers[1][:n_rows], buffers[2][:n_steps]
-            is_copied = 2 * n_rows < len(buffers[0])  # a copy of a buffer that is less than half full saves memory
+            is_copied = 2 * n_rows < len(buffers[0])  # copy a buffer that is less than half full, to save memory
             if is_copied:
                 t, rows, steps = t.copy(), rows.copy(), steps.copy()
             if in_crossing and n_steps and self.request.between_steps:
@@ -293,7 +293,7 @@ class IntegrationLoop:
             if run.clock[a.SAMPLES_MOTION] == 1.0 and not self.interrupts.n_signals:
                 run.clock[a.SAMPLES_MOTION] = self.control[a.SAMPLE_MOTION] = 0.0
             elif is_crossing and not run.system.called_in_python and not self.interrupts.n_signals:
-                run.clock[a.FAILURE_CODE] = indices.NOT_FINITE  # the attempt fails; its positions may be unreachable
+                run.clock[a.FAILURE_CODE] = indices.NOT_FINITE  # failed attempt, perhaps at unreachable positions
             else:
                 self.code, self.callback_error = INTERRUPTED, None if self.interrupts.n_signals else error
                 if not run.system.called_in_python:
@@ -467,7 +467,7 @@ class IntegrationLoop:
             status, message = Status.INTERRUPTED, describe_interrupt(time_reached, table)
         t_events, q_events, v_events = recorder.events()
         fields: dict[str, Any] = state_fields(run.system.n_q, t, table) | {k: store.array(k) for k in STEP_ARRAYS}
-        fields |= {"rank": run.rank, "redundant": run.redundant.copy()}  # copies of a run share this array
+        fields |= {"rank": run.rank, "redundant": run.redundant.copy()}  # a copy: several runs share this array
         fields |= {"defect": run.defect(), "widest_gap": float(run.work.notes[indices.WIDEST_GAP])}
         fields |= message_of(run, message + failure_link(status), self.system)
         fields |= {"status": status, "stats": stats, "sol": recorder.solution(), "system": self.system}
@@ -484,7 +484,7 @@ class IntegrationLoop:
         return [(float(t[-2]), table[-2])] if has_velocity_jump_at_end(t, table, run.system.n_q) else []
 
     def _suspicious_outputs(self, t: Array, table: Array) -> list[TimedState]:
-        """If the run passed near a singular position, return the states (if steps had to end at them); else []."""
+        """Return all output states if the run passed near a singular position, and steps ended at them; else []."""
         run, request = self.run, self.request
         equal_steps = run.control[run.a.FIXED_STEP] > 0.0 and request.times is None
         if not run.passed_near_singular() or not (

@@ -84,8 +84,8 @@ INITIAL_FACTOR = 0.1
 # the dominant eigenvalue is negative if the cosine of the angle from a direction to its image is below -MIN_ALIGNMENT
 MIN_ALIGNMENT = 0.9
 MIN_STEPS = 200  # after fewer accepted steps, a message does not mention stiffness
-# stability counts as the limit of the steps if the median of h * rate / limit over the samples is at least this (`h`:
-# step size; `rate`: of the fastest vibration or decay; `limit`: largest stable h * rate). In smooth motion it is 0.4
+# stability limited the steps if, over the samples, the median of h * rate / limit is at least this. `h`: step size;
+# `rate`: of the fastest vibration or decay; `limit`: largest stable h * rate. In smooth motion, the median is 0.4
 MIN_STABILITY_RATIO = 0.45
 
 

@@ -51,7 +51,7 @@ class Options:
 
     @cached_property
     def metadata(self) -> dict[str, Any]:
-        """Fields `method` and `rtol` of a result; also `untested` = None if all steps test the errors of q and v."""
+        """Fields `method` and `rtol` of a result; also `untested` = None if every step tests errors of q and v."""
         tested = getattr(self.method, "tested", "all")
         return {"method": self.method.name, "rtol": self.rtol} | ({} if tested == "positions" else {"untested": None})
 
@@ -62,7 +62,7 @@ class Options:
             run.set_step_sizes(self.first_step, self.max_step, t1)
 
 
-NO_OPTIONS: Any = (None,) * 12, None  # last arguments and options, if there was no call before
+NO_OPTIONS: Any = (None,) * 12, None  # what is stored before the first call: arguments and options
 
 
 def options_of(

@@ -32,8 +32,8 @@ Array = NDArray[np.float64]
 MIN_SINE = 1e-5  # a dead centre is near if the sine of the angle from a row of C_q to the span of the others is smaller
 # MAX_CORRECTIONS: largest number of Newton iterations; they end when a correction is at most ROUNDING times max|q|
 MAX_CORRECTIONS, ROUNDING = 25, 1e-14
-# a displaced guess leads to the same assembly if the position predicted by C_q, to first order, differs from its
-# projection by at most this fraction of the displacement
+# C_q predicts, to first order, the projection of a displaced guess. The guess leads to the same assembly if prediction
+# and projection differ by at most this fraction of the displacement
 MAX_NONLINEARITY = 0.5
 
 
@@ -182,13 +182,13 @@ def _nearby_guesses_match(projection: _SparseProjection, position: Array, change
 
 
 MAX_ITERATIONS = 50  # largest number of Gauss-Newton iterations
-# below this violation, relative to the violation that is allowed at a start, the iteration ends when a step no longer
-# halves the violation
+# the iteration ends if the violation is at most this fraction of the violation that is allowed at a start, and the last
+# step has not halved it
 CONVERGED_VIOLATION = 1e-2
 # singular values count as zero if they are below this fraction of the largest one: RANK_CUTOFF for ranks, LSTSQ_CUTOFF
 # for least-squares solutions, REDUNDANT_CUTOFF for least-squares solutions with redundant rows
 RANK_CUTOFF, LSTSQ_CUTOFF, REDUNDANT_CUTOFF = 1e-10, 1e-13, 1e-2
-# a dead centre is near if the ratio of the smallest to the largest singular value is at most this
+# a dead centre is near if the ratio of the smallest to the largest singular value of C_q is at most this
 DEAD_CENTRE_RATIO = 0.01
 # two positions count as equal if their distance is at most this fraction of the largest change by the projection
 MAX_EQUAL_DISTANCE = 0.1
@@ -349,7 +349,7 @@ def _projected_position(
     position, excess, iterations = _gauss_newton(system, t, guess, free)
     has_redundant_rows = position is None or _rank(scales.scaled(system.jacobian(t, position))) < system.n_c
     cutoff = REDUNDANT_CUTOFF if has_redundant_rows else LSTSQ_CUTOFF
-    if has_redundant_rows:  # off the constraints, redundant rows are only nearly dependent
+    if has_redundant_rows:  # repeat with the larger cutoff: off the constraints, these rows are nearly dependent
         position, excess, iterations = _gauss_newton(system, t, guess, free, cutoff)
     if position is None or not excess <= 1.0:
         has_diverged = position is None

@@ -147,7 +147,7 @@ class OutputRequest(NamedTuple):
 class Recorder:
     """Recorder of the states of accepted steps, chunk by chunk.
 
-    A step is searched for events when all nodes of its polynomials are known, so that output does not depend on chunks.
+    A step is searched for events when all states that its polynomials interpolate are known: chunks do not matter then.
     Event functions are evaluated at least every `max_gap` seconds.
     """
 
@@ -164,7 +164,7 @@ class Recorder:
         self.n_steps = 0  # number of steps searched for events so far; the last one may contain a terminal event
         self.last_step_size = 0.0  # time (s) from the beginning of the run's last step to the terminal event
         self.interrupted = False  # whether Ctrl-C interrupted the search for events, or the interpolation
-        # states at the ends of intervals still to be searched, and earlier nodes of the polynomials in these intervals
+        # states at the ends of intervals still to be searched, and earlier states that their polynomials interpolate
         self._t, self._rows = np.array([t0]), state[None, :].copy()
         self._kinds = np.empty(0, dtype=np.int64)
         self._next_interval = 0  # index, in `_t` and `_kinds`, of the first interval that is still to be searched

@@ -27,7 +27,7 @@ from twoloop.run.run import Run
 
 Array = NDArray[np.float64]
 
-FIRST_FORCE = "first force"  # key in `system.derived`: force at the start, if the callback is compiled but not traced
+FIRST_FORCE = "first force"  # key in `system.derived` of the force at the start, if `force` is compiled but not traced
 N_DERIVATIVES = 4  # number of states of a run at which derivatives are checked after the run, including the last state
 
 
@@ -134,7 +134,7 @@ def python_functions(system: ConstrainedSystem) -> PythonFunctions | None:
 
 
 def first_force(system: ConstrainedSystem, t0: float, q0: Array, v0: Array) -> tuple[Any, Array] | None:
-    """Return ((t0, q0, v0), force there) if the force is compiled; else discard the force samples of earlier runs."""
+    """Return ((t0, q0, v0), force there) if the force is compiled; else forget earlier force samples, return None."""
     if functions := python_functions(system):
         functions.restart()
         return None

@@ -45,9 +45,9 @@ Buffers = tuple[Array, Array, Array]  # times, states and steps
 FIRST_CHUNK = 1024
 FIRST_CHUNK_IN_PYTHON = 64  # the same number if callbacks are Python functions, which are slow
 SMALL_SYSTEM = 32  # largest number of coordinates of a small system; larger systems have proportionally smaller chunks
-TRIAL_STEPS = 10  # a method that is fast only with long steps is replaced if one of its first TRIAL_STEPS is short
+TRIAL_STEPS = 10  # a method that is fast only with long steps is replaced if one of its first 10 steps is short
 NO_PATTERN = np.zeros((0, 0))  # the fixed-order form needs no pattern of the nonzero entries of constraint rows
-# a row of C_q a = gamma contradicts the other rows if its residual exceeds this fraction of the sum of |terms|
+# a row of C_q a = gamma contradicts the other rows if its residual exceeds this fraction of the sum of its |terms|
 CONTRADICTION = 1e-6
 
 
@@ -96,7 +96,7 @@ class Run:
         self.control[loop_state.FIXED_STEP] = 0.0 if step_size is None else step_size
         self.control[loop_state.MAX_STEPS] = np.inf
         self.control[loop_state.MAY_CROSS], self.control[loop_state.SAMPLE_MOTION] = self.fixed_order is None, 1.0
-        rate_kinds = system.given.keys() & {"constraint_rate", "nonholonomic_rate"}  # else C_t = 0, b = 0
+        rate_kinds = system.given.keys() & {"constraint_rate", "nonholonomic_rate"}  # if empty: C_t = 0, b = 0
         self.control[loop_state.MAY_JUMP] = bool(rate_kinds)
         first_chunk = FIRST_CHUNK_IN_PYTHON if system.called_in_python else FIRST_CHUNK
         self.chunk = max(1, first_chunk // max(1, system.n_q // SMALL_SYSTEM))  # largest number of attempts in a chunk
@@ -115,7 +115,7 @@ class Run:
         self.control[[loop_state.BY_TIME, loop_state.BY_STATE]] = self.short_forces
         self.forces_may_be_steep = steep or plan.max_gap == 1.0
         self.crossings: list[list[tuple[float, Array]]] = []  # states before and after steps across singular positions
-        # data of steps across a singular position, see fallbacks.py
+        # the next six attributes belong to steps across a singular position, see fallbacks.py
         self.mirrored_size = 0.0  # size (s) of a step that begins and ends equally far from the singular position
         self.crossing_tolerances = self.tolerances  # tolerances of steps across singular positions
         self.sizes_to_try: list[float] = []  # step sizes (s) still to be tried across a singular position
@@ -368,7 +368,7 @@ class Run:
         return describe_singular_start(self.system, self.t0, q, self.rank, self.rtol, atol)
 
     def violated_rows(self, rows: Rows) -> NDArray[np.int64]:
-        """Return the indices of the constraint rows that the accelerations at the start violate; `rows`: all rows."""
+        """Return the indices of the constraint rows that the accelerations at the start violate; `rows`: G."""
         n = self.system.n_q
         a, gamma = self.state[2 * n : 3 * n], self.work.Gamma
         residual = np.abs(rows @ a - gamma)
@@ -408,7 +408,7 @@ class Run:
         self.control[self.a.MAX_STEP], self.control[self.a.MAX_EVALUATION_GAP] = min(self.max_step, max_size), gap
 
     def choose_first_step(self, t: float, t1: float, state: Array, longest: float = 0.0) -> float:
-        """Return the size (s) of the first step from a state; if `longest` (max_step) > 0, also limit later sizes."""
+        """Return the size (s) of the first step from a state; if `longest` (max_step) > 0, set limits of step sizes."""
         numbers = self.system.n_q, t, t1, self.least_atol, longest, self.plan.evaluates_within
         size: float = entry_point(cached_run().first_step_and_limits)(self.control, self.tolerances, state, *numbers)
         return size

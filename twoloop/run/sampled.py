@@ -64,7 +64,7 @@ class SampledRun:
     """Integrate step by step between sampling times; the parameters of forces may change at these times.
 
     `set_parameters` overwrites parameters of `system`, so `system` must not be used elsewhere. Raise TypeError or
-    ValueError if the start is invalid; also if the method is Taylor or Lobatto16: their code needs fixed parameters.
+    ValueError if the start is invalid; also for Taylor and Lobatto16: their generated code has fixed parameters.
     """
 
     def __init__(
@@ -256,7 +256,7 @@ class SampledRun:
         self._parameters_changed = False
 
     def _finish_by_loop(self, end: float) -> None:
-        """Let IntegrationLoop go on to `end`, before which `advance` has stopped; raise RuntimeError if this fails."""
+        """Let IntegrationLoop integrate to `end`, as `advance` has stopped before; raise RuntimeError on failure."""
         run = self.run
         run.t0, run.start_warning = float(run.clock[run.a.T]), ""
         interrupts = Interrupts().install_handlers()

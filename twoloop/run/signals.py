@@ -79,7 +79,7 @@ class SignalHandlers:
 
 
 def signals_of(system: ConstrainedSystem) -> AbstractContextManager[Any]:
-    """Return the context in which to run machine code: `SignalHandlers` if it calls Python callbacks, else none."""
+    """Return the context for machine code: `SignalHandlers` if it calls Python callbacks, else one without effect."""
     return SignalHandlers(ctrl_c=True) if system.called_in_python else nullcontext()
 
 

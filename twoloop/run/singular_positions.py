@@ -153,7 +153,7 @@ def _crossing_ends(crossings: Crossings, end_state: TimedState) -> Iterator[tupl
 
 
 def _largest_acceleration(system: ConstrainedSystem, t: float, q: Array, v: Array, min_ratio: float) -> float:
-    """Return max|a_j| without the constraints whose singular value is below `min_ratio` times the largest one."""
+    """Return max|a_j|; omit singular values of the constraint Jacobian below `min_ratio` times the largest one."""
     mass, rows, norms, units = scaled_to_unit_masses(system, t, q)
     left, values, right = np.linalg.svd(rows, full_matrices=False)
     is_kept = values > min_ratio * values[0]
@@ -196,7 +196,7 @@ def _describe_ratio(ratios: dict[float, float]) -> str:
 
 
 ROUNDING = 0.5 * float(np.finfo(np.float64).eps)
-# rounding errors of velocities are estimated only if a singular value of the Jacobian is at most this times the largest
+# rounding errors of velocities are estimated only if smallest / largest singular value of the Jacobian is at most this
 WEAK_RATIO = 1e-2
 # rounding errors of velocities are estimated, whatever the tolerances, if the ratio of smallest to largest pivot
 # of the Jacobian is below SMALL_PIVOT. This ratio is typically PIVOT_FACTOR times the ratio of singular values

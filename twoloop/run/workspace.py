@@ -114,11 +114,11 @@ def _derivative_entries(
 # an eigenvector of a body's diagonal block of M counts as massless if its eigenvalue is at most this fraction of the
 # block's largest eigenvalue
 MASSLESS_RATIO = 1e-10
-# if M is singular, g g^T may be added to M for a row g of C_q whose component along massless directions is longer than
+# if M is singular, g^T g may be added to M for a row g of C_q whose component along massless directions is longer than
 # this fraction of g
 MIN_MASSLESS_FRACTION = 1e-3
-MIN_SIZE_NEWTON = 1.6  # n_q / LARGE (callbacks.py) above which Newton's matrix may be factorized as a sparse matrix
-MAX_SHARE = 0.05  # sparse factors of M and C_q are used if they take at most this fraction of dense operations
+MIN_SIZE_NEWTON = 1.6  # Newton's matrix may be sparse if n_q exceeds this times LARGE (callbacks.py)
+MAX_SHARE = 0.05  # sparse factors of M and C_q are used if they need at most this times the operations of dense ones
 
 
 class FixedOrderForm(NamedTuple):
@@ -221,10 +221,10 @@ def _coordinates_of_bodies(system: ConstrainedSystem, mass: Entries) -> list[tup
 def _stiff_rows(
     system: ConstrainedSystem, t0: float, q0: Array, mass: Entries, jacobian: Entries, bodies: list[tuple[int, ...]]
 ) -> list[int]:
-    """Return the indices of rows g of C_q for which g g^T is added to a singular M to make it invertible.
+    """Return the indices of rows g of C_q for which g^T g is added to a singular M to make it invertible.
 
     See sparse_ldl.py. Only rows that concern one body, such as the norm of its Euler parameters, may be chosen: where M
-    is zero, g g^T must be zero, too. No more rows than necessary are chosen.
+    is zero, g^T g must be zero, too. No more rows than necessary are chosen.
     """
     values = system.mass_values(t0, q0) if "mass" in system.entries else system.mass(t0, q0)[mass]
     body_of = np.array(bodies_of(system.n_q, mass, bodies))
@@ -382,7 +382,7 @@ def kit_for_plan(system: ConstrainedSystem, flags: Array, plan: Plan | None) -> 
 
 
 def _steps_of_plan(plan: Plan) -> tuple[Any, Any, Any]:
-    """Return the step function of a plan, and both of a pair of methods (the second one only if already loaded)."""
+    """Return the steps `step`, `first` and `second` of a plan; None instead of a second one that is not loaded yet."""
     return load_step(plan.step), load_step(plan.first), step_if_loaded(plan.second)
 
 

@@ -78,7 +78,7 @@ def _slope_and_size(w, row, length):
 
 @compiled
 def _allowed_error(f, w, tolerances, x, row):
-    """Return the allowed error of (G x)[row], the largest |G[row, j]| tolerance of x[j]; G: constraint Jacobian."""
+    """Return the allowed error of (G x)[row]: max over j of |G[row, j]| times the tolerance of x[j]; G: Jacobian."""
     largest = 0.0
     if f.form == FIXED_ORDER:
         rows, columns, _ = jacobian_entries_of(f.ldl_program)
@@ -161,7 +161,7 @@ def locate_discontinuity(f, w, t, end, q, v, velocity, tolerances):
 N_SAMPLES = 20  # number of intervals between the samples of one set, which therefore has 21 samples
 MIN_TIME_AHEAD = 12.0  # shortest time over which the motion is sampled ahead, in units of control[SPACING]
 SUDDEN_RATIO = 0.1  # a change is sudden if the second difference exceeds this fraction of the range of the samples
-# changes of a force, C_t or b are ignored if the range of the samples is at most LEAST_RANGE rtol times the largest
+# changes of a force, C_t or b are ignored if the range of the samples is at most LEAST_RANGE * rtol times the largest
 # value so far, or at most LEAST_VALUE, because squares of smaller values underflow
 LEAST_RANGE, LEAST_VALUE = 0.1, 1e-150
 MIN_SAMPLES_IN_STEP = 8.0  # least number of samples in a step: all stages may miss a force that lasts a quarter of it
@@ -182,7 +182,7 @@ CHANGE_MARGIN = 0.01  # a change at most this number of sample spacings after th
 # rows of w.changes, whose columns are the forces, C_t and b: rows 0 to N_SAMPLES are the samples of one set
 LARGEST_ROW = N_SAMPLES + 1  # largest |value| of each column so far
 MIDDLE_ROW = N_SAMPLES + 2  # values at a time between two samples
-N_CHANGES = N_SAMPLES + 3  # number of rows
+N_CHANGES = N_SAMPLES + 3  # number of rows of w.changes
 
 
 @compiled
@@ -339,7 +339,7 @@ def first_discontinuity(f, w, tolerances, clock, t, begin, spacing, last, follow
 
 @compiled
 def _record_short_change(f, w, tolerances, control, clock, t, size, last, q, v, a):
-    """Update clock[SHORTEST_CHANGE] by changes within a short step which the samples ahead of it have missed."""
+    """Update clock[SHORTEST_CHANGE] by changes within a short step that earlier samples missed; sample until `last`."""
     changes, spacing, begin, end = w.changes, control[at.TIME_SPACING], clock[at.T_START], t + size
     clock[at.COMPARED] = t
     if end + spacing > last or (t - 2.0 * spacing < begin and end + 2.0 * spacing > last):
@@ -388,7 +388,7 @@ def _acceleration_lasts(f, w, tolerances, t, duration, q, v, a, Q, V, A):
 def _sample_motion(f, w, tolerances, control, clock, spacing, t, size, last, q, v, a, Q, V, A):
     """Sample forces, C_t and b along the motion; store the time of the next sudden change in `clock`.
 
-    The samples extend over the step size, or over MIN_TIME_AHEAD times `spacing` if that is longer.
+    The samples extend over the step size, or over MIN_TIME_AHEAD times `spacing` if longer, but not beyond `last`.
     """
     if clock[at.MOTION_SAMPLED_TO] >= t + (1.0 - CHANGE_MARGIN) * size:
         return
@@ -403,7 +403,7 @@ def _sample_motion(f, w, tolerances, control, clock, spacing, t, size, last, q, 
             f, w, tolerances, clock, t, t, duration / N_SAMPLES, last, 1.0, q, v, A
         )
     clock[at.SAMPLES_MOTION] = 0.0
-    # close samples along the motion replace samples at a fixed state, unless the last sample of these is at a change
+    # close samples along the motion replace samples at a fixed state, unless the latter end at a sudden change
     change_found = clock[at.SAMPLED_TO] == clock[at.DISCONTINUITY] > t
     if not change_found and duration <= N_SAMPLES * min(control[at.TIME_SPACING], size / MIN_SAMPLES_IN_STEP):
         clock[at.WIDEST_SAMPLING] = max(clock[at.WIDEST_SAMPLING], duration / N_SAMPLES)
@@ -416,7 +416,7 @@ def _sample_motion(f, w, tolerances, control, clock, spacing, t, size, last, q, 
 
 @compiled
 def _sample_ahead(f, w, tolerances, control, clock, next_change, t, size, last, q, v, a):
-    """Sample forces, C_t and b ahead at fixed q and v; return the time of the first sudden change, or `next_change`."""
+    """Sample forces, C_t and b at fixed q, v until `last`; return `next_change`, or the time of an earlier change."""
     max_spacing = max(min(control[at.TIME_SPACING], size / MIN_SAMPLES_IN_STEP), MIN_SPACING * np.spacing(abs(t)))
     # times that have been sampled before are sampled again if samples must be closer now. This is not necessary for
     # multistep methods (JUMP_RATIO = 1), whose error estimates show a jump; nor if C_t or b may jump (MAY_JUMP = 1):
@@ -425,7 +425,7 @@ def _sample_ahead(f, w, tolerances, control, clock, next_change, t, size, last, 
     if may_resample and max_spacing < RESAMPLE_BELOW * clock[at.SAMPLED_EVERY]:
         clock[at.SAMPLED_TO] = t
     begin = max(t, clock[at.SAMPLED_TO])
-    is_at_change = clock[at.DISCONTINUITY] == clock[at.SAMPLED_TO]  # then only samples as close as before show it again
+    is_at_change = clock[at.DISCONTINUITY] == clock[at.SAMPLED_TO]  # if so, wider samples would not show it again
     while begin < min(t + size, last, next_change):
         spacing, is_at_change = min(max_spacing, clock[at.SAMPLED_EVERY]) if is_at_change else max_spacing, False
         clock[at.WIDEST_SAMPLING] = max(clock[at.WIDEST_SAMPLING], spacing)

@@ -101,7 +101,7 @@ H, ERRORS, FAILURES, PARTITIONS, JACOBIANS, N_STEP_COLUMNS = range(6)
     SHORTEST_CHANGE,  # shortest time (s) from a sudden change to the next one so far; infinite: fewer than two changes
     MOTION_SAMPLED_TO,  # time (s) of the last sample along the motion
     SAMPLES_MOTION,  # 1 while callbacks are called at predicted states: exceptions there do not end the run; 0: else
-    # smallest ratio of pivots at output times and at ends of steps of fixed size, see `record_pivot_at_output`
+    # smallest value, at output times and at ends of steps of fixed size, of (smallest / largest pivot of C_q)
     PIVOT_AT_OUTPUT,
     # smallest pivot of C_q within steps taken while MAY_CROSS was SUSPENDED, divided by LARGEST_PIVOT; 0: no such step
     PIVOT_PASSED,
@@ -111,7 +111,7 @@ H, ERRORS, FAILURES, PARTITIONS, JACOBIANS, N_STEP_COLUMNS = range(6)
 # constants of the power iterations in stiffness.py and run/messages.py. They estimate the largest rate of the motion,
 # rho (1/s), from the largest eigenvalues of dF/dq and dF/dv, where F(q, v) are the accelerations
 DISPLACEMENT = 1e-6  # displacement of q (or v) in finite differences, relative to the largest coordinate (or velocity)
-INNER_TOL = 1e-8  # largest last correction by Newton's method when displaced positions are moved onto the constraints
+INNER_TOL = 1e-8  # Newton's method, which projects displaced positions, stops after a correction of at most this
 
 
 def initial_direction(n_q: int) -> NDArray[np.float64]:

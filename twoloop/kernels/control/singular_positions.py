@@ -194,7 +194,7 @@ def check_partition(f, w, control, clock, size, at_output, state):
         # pivots are computed when a partition is chosen: old ones do not show the approach to a singular position
         if renew_partition(f, w, clock[at.T], state[:n]) != DONE:
             return at.RANK_LOST
-        w.sensitivity = 1.0  # its value far from singular positions, so that `partition_is_poor` soon holds again
+        w.sensitivity = 1.0  # its value far from singular positions, so that `partition_is_poor` soon is True again
         if w.pivot < SINGULAR_PIVOT * clock[at.LARGEST_PIVOT]:
             w.nearly_singular = w.near_now = 1.0
     if short and size < MIN_STEP_NEAR_SINGULAR * clock[at.H_LONG] and w.nearly_singular == 1.0:

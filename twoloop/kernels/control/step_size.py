@@ -59,7 +59,7 @@ def step_size_ratio(rule, past, h, error):
 
 @merged
 def record_accepted_step(rule, past, h, error):
-    """Store size h (s) and `error` (in tolerances) of an accepted step in `past`, the history of step-size control."""
+    """Store size h (s) and `error` (in tolerances, at least rule[LEAST_ERROR]) of an accepted step in `past`."""
     past[H_BEFORE], past[ERROR_BEFORE] = h, max(error, rule[LEAST_ERROR])
 
 
@@ -105,7 +105,7 @@ def size_on_grid(clock, t, h, target, goal):
 
 @merged
 def size_off_grid(control, t, h, left, crosses_jump):
-    """Return the size (s) of a step (about h at most), and whether it reaches the goal, a time `left` s after t."""
+    """Return the size (s) of a step, about h at most, and True if it ends at t + left (always if `crosses_jump`)."""
     reaches_goal = crosses_jump or h >= left * (1.0 - 1e-10)
     size = h
     if h > 0.5 * left and not reaches_goal:
@@ -130,7 +130,7 @@ def count_step(w, tolerances, control, clock, size, out_step):
     gap = size
     if w.defect >= 0.0:
         gap = min(size, tolerances[DEFECT_GAP])
-    elif is_beyond_gap(tolerances, size):  # (only methods that evaluate often within a step exceed GAP)
+    elif is_beyond_gap(tolerances, size):  # only a step with evaluations within it may be longer than GAP
         gap = control[at.MAX_EVALUATION_GAP] * size
     w.widest_gap = max(w.widest_gap, gap)
     clock[at.H_LONG] = max(size, H_LONG_DECAY * clock[at.H_LONG])

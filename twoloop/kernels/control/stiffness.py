@@ -338,7 +338,7 @@ def _phase_to_begin(f, w, options, memory, tolerances, t, state, new_state):
         or is_costly
         or (memory[N_ABOVE_LIMIT] >= options[N_ESTIMATES] and is_cheap)
     )
-    if is_cheap and h_rho <= 1.0:  # (else N_ABOVE_LIMIT keeps its value, so that a trial begins when it is cheap)
+    if is_cheap and h_rho <= 1.0:  # if trials cost too much, N_ABOVE_LIMIT is kept: one begins later
         memory[N_ABOVE_LIMIT] = 0.0
     is_expensive = cost_per_second > MIN_GAIN * memory[COST_PER_SECOND]  # the explicit method cost less
     if (memory[PHASE] == EXPLICIT and is_due) or (memory[PHASE] == IMPLICIT and (h_rho < RETURN_BELOW or is_expensive)):

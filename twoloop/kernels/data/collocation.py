@@ -48,8 +48,8 @@ CONVERGED, REJECTED, GUESSED, NOT_COMPUTED = range(4)
 # offsets of arrays that follow the single numbers
 POWERS = 32  # offset of eight numbers: powers 1 to 8 of H / H_BEFORE
 SCALED = 40  # offset of eight numbers: coefficients of the polynomial that predicts an acceleration, times POWERS
-MOVED = 48  # offset of eight numbers, one for each projected end of a step: largest last correction of a coordinate
-VALID = 56  # offset of eight numbers, one for each projected end of a step: 1 if its projection is valid, else 0
+MOVED = 48  # offset of eight numbers, one for each projected end of a step: max|correction of q| in its last iteration
+VALID = 56  # offset of eight numbers, one for each end of a step: 1 if its projection converged, else 0
 DEFECTS = 64  # offset of eight numbers: values of DEFECT in successive steps
 WEIGHTS = 72  # offset of n_q numbers: weights, 1 / (allowed error of the velocity) for each coordinate
 

@@ -64,7 +64,7 @@ class Work(NamedTuple):
     pattern: Any  # (n_c + n_a, n_q) 1 for entries of the constraint Jacobian that have been nonzero in the run, else 0
     mass_pattern: Any  # (n_q, n_q) 1 for entries of M that have been nonzero, else 0; only in the form AUGMENTED
     row_entries: Any  # for each row of G, the index of its list in this array; then the lists: columns of its entries
-    Gamma_tried: Any  # (2, n_c + n_a) Gamma by differences with twice the time step e, and with the previous value of e
+    Gamma_tried: Any  # (2, n_c + n_a) Gamma by finite differences with twice the time step, and with the last time step
     rates: Any  # (13, n_c + n_a) constraint rates C_t and b at 13 times within a step, see discontinuities.py
     changes: Any  # (N_CHANGES, n_q + n_c + n_a) samples of forces and constraint rates, see discontinuities.py
     Q: Any  # (n_q) generalized forces
@@ -105,7 +105,7 @@ class Work(NamedTuple):
     factors: Any  # entries of the factors of the augmented matrix, at the indices that f.ldl_program contains
     pivot_sizes: Any  # (N) squared norms of rows, to which the pivots are compared, see linalg/sparse_ldl.py
     unknowns: Any  # (N) right-hand side when a solver is called, solution when it returns
-    solutions: Any  # (3 N) scratch; then (n_c) for each row g of C_q, the factor s of the term s g g^T added to M, or 0
+    solutions: Any  # (3 N) scratch; then (n_c) for each row g of C_q, the factor s of the term s g^T g added to M, or 0
 
     sizes: Any = None  # the numbers that determine the sizes of all arrays, see `Sizes` in layout.py
     address: Any = 0  # address of `table`

@@ -34,7 +34,7 @@ from twoloop.kernels.compile.callbacks import OPTIONAL_KINDS
     IS_GENERATED,  # 1: the inner loop is code generated for the mechanism; 0: it is the general one
     FIRST_GIVEN,  # index of the first flag of an optional callback, see GIVEN
 ) = range(7)
-MULTIPLIERS, NULL_SPACE, AUGMENTED, FIXED_ORDER = range(4)  # values of FORM: saddle_point.py, sparse_inner_loop.py
+MULTIPLIERS, NULL_SPACE, AUGMENTED, FIXED_ORDER = range(4)  # values of FORM, see saddle_point.py, sparse_inner_loop.py
 # index in Functions.flags for the name of each optional callback; the flag is 1 if the callback is given, else 0
 GIVEN = {name: index for index, name in enumerate(OPTIONAL_KINDS, FIRST_GIVEN)}
 N_FLAGS = FIRST_GIVEN + len(GIVEN)
@@ -63,7 +63,7 @@ FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN, REACTION_BY_Q_GIVEN, MASS_VALUES_GIVEN = (
     ORIENTATION_NEW,  # sign of det C_qd (dependent columns of C_q) at the end of the attempted step; 0: not known
     FAULT_KIND,  # index in Functions of a callback that returned NaN or infinity; -1: none known
     FAULT_TIME,  # time (s) at which this callback returned NaN or infinity
-    GAMMA_REQUIRED,  # allowed error of Gamma by differences (evaluation/constraints.py), relative to GAMMA_SCALE
+    GAMMA_REQUIRED,  # allowed error of Gamma by finite differences (evaluation/constraints.py), relative to GAMMA_SCALE
     GAMMA_STEP_RATIO,  # time step of the differences for Gamma, relative to the result of `largest_difference_step`
     GAMMA_ACCURACY,  # error of Gamma, relative to GAMMA_SCALE, when GAMMA_STEP_RATIO was chosen last
     GAMMA_SCALE,  # size of Gamma, to which its errors are compared: largest |entry|, or sum of |terms| of G a, so far
@@ -73,7 +73,7 @@ FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN, REACTION_BY_Q_GIVEN, MASS_VALUES_GIVEN = (
     RANK,  # rank of C_q, stored only if the workspace was allocated for another rank (code RANK_DIFFERS)
     RANK_V,  # rank of [C_q; A], stored together with RANK
     CONTRADICTION,  # with the code ROWS_CONTRADICT: index of a violated row of [C_q; A]
-    PIVOT,  # smallest pivot of C_q, rows scaled to 1, at the last full pivoting; small near a singular position
+    PIVOT,  # smallest pivot of C_q (rows scaled to norm 1) at the last full pivoting; small near a singular position
     # 1: the run has come near a singular position, or does not check for one; 2: near one, project stages; 0: else
     NEARLY_SINGULAR,
     NEAR_NOW,  # 1: a singular position was near at the last check; 2: the next check chooses a new partition; 0: else
