@@ -172,8 +172,8 @@ CHECKSUM_SIZE = hashlib.sha256().digest_size  # length (bytes) of the checksum a
 class CodeFiles:
     """Store the machine code of a function on disk, in one file with a checksum for each key.
 
-    Only the user can write these files. A file that is damaged or out of date counts as missing. Numba's cache has an
-    index of its files, which two processes may spoil if they write it at the same time; this class has no index.
+    Only the user can write these files. A file that is damaged or out of date (another `stamp` or version of numba)
+    counts as missing. There is no index of the files: two processes may spoil that of numba's own cache.
     """
 
     def __init__(self, folder: Path, name: str, stamp: Any, is_limited: bool = False):
@@ -265,7 +265,7 @@ def compile_cached(
 
 @contextmanager
 def garbage_collection_off() -> Iterator[None]:
-    """Return a context without garbage collection, which frees nothing, but takes a sixth of the compile time."""
+    """Return a context without garbage collection, which would take a sixth of the compile time, and free nothing."""
     was_enabled = gc.isenabled()
     gc.disable()
     try:
@@ -385,7 +385,7 @@ def compiled_when_called(**options: Any) -> Callable[[Callable[..., Any]], Dispa
         digests = digests_of(function)
         dispatcher = njit(**options)(give_unique_name(function, digests))
         if digests is not None:
-            # if a callback calls this function, `_use_twoloop_cache` compares digests, and need not recompile it
+            # if a callback calls this function, `_use_twoloop_cache` recompiles it only if its digests have changed
             _COMPILED_DIGESTS[dispatcher] = digests
             with suppress(RuntimeError):  # no folder can be written
                 dispatcher._cache = _CodeCache(dispatcher.py_func, *digests, "")
@@ -397,10 +397,10 @@ def compiled_when_called(**options: Any) -> Callable[[Callable[..., Any]], Dispa
 def digests_of(function: Callable[..., Any]) -> tuple[str, str] | None:
     """Return two digests of all values on which the machine code of a function depends; set up its helpers' caches.
 
-    The first digest is of the code, defaults and globals of the function, and of attributes of modules that it uses.
-    The second digest is of its closure variables. Compiled functions among these values are called helpers. The digests
-    include the values that a helper uses, and twoloop's cache replaces numba's cache of the helper. Return None if a
-    value could change without a change of the digests.
+    The helpers are the compiled functions that the function calls: twoloop's cache replaces numba's cache of them. The
+    first digest is of the code, defaults and globals of the function, and of attributes of modules that it uses. The
+    second digest is of its closure variables. Both include the values that helpers use. If a value could change without
+    a change of the digests, return None.
     """
     digests, helpers = _digests_and_helpers(function)
     for each in helpers:

@@ -34,7 +34,7 @@ from twoloop.kernels.compile.dependencies import (
 from twoloop.kernels.compile.linking import add_signature, options_of
 
 BOUNDS_CHECK = {"boundscheck": True}  # option of numba: machine code raises IndexError for an invalid index
-# built-in functions: if all arguments are constants or loop counters, so is the result
+# built-in functions: if all arguments need no check as indices (constants, loop counters), nor does the result
 SAFE_CALLS = ("len", "min", "max", "abs", "range", "enumerate", "zip", "reversed")
 
 
@@ -107,7 +107,7 @@ def _is_safe_index(node: ast.AST | None, computed: set[str]) -> bool:
     if isinstance(node, ast.Subscript):
         return _is_safe_index(node.value, computed) and _is_safe_index(node.slice, computed)
     if isinstance(node, ast.BinOp | ast.UnaryOp | ast.Tuple | ast.List | ast.Slice):
-        kinds = (ast.operator, ast.unaryop, ast.expr_context)  # these nodes are no expressions: skip them
+        kinds = (ast.operator, ast.unaryop, ast.expr_context)  # nodes of operators, not of expressions: skip them
         return all(_is_safe_index(each, computed) for each in ast.iter_child_nodes(node) if not isinstance(each, kinds))
     return False
 
@@ -117,7 +117,7 @@ VECTOR = numba.types.float64[::1]
 READ_ONLY_VECTOR = numba.types.Array(f8, 1, "C", readonly=True)  # in memory, the same as VECTOR
 MATRIX = numba.types.float64[:, ::1]
 
-# name of the attribute of a system that is the size of a vector which callbacks receive; lam: multipliers of C = 0
+# for each vector that callbacks receive, the attribute of a system that is its size; lam: multipliers of C = 0
 STATE_SIZES = {"q": "n_q", "v": "n_q", "lam": "n_c"}
 
 
@@ -407,7 +407,7 @@ def _compile_with_writable_inputs(
 ) -> Dispatcher:
     """Compile a callback with writable input arrays, because its helpers may not accept read-only arrays.
 
-    Raise TypeError if the callback itself writes to its inputs. `error`: exception of compiling with read-only inputs.
+    Raise TypeError if the callback writes to its inputs. `error`: raised with read-only inputs. See `compile_callback`.
     """
     try:
         dispatcher = compile_cached(function, KINDS[kind].signature, digests, **options)

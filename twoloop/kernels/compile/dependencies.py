@@ -137,7 +137,7 @@ class Digest:
         self.hash.update(f"{module}.{name}".encode())
 
     def _is_new(self, value: Any, name: str = "") -> bool:
-        """If a value is new, register it and return True; else hash the serial number of its first occurrence."""
+        """If a value is new, register it and return True; else hash the number that it got at its first occurrence."""
         key = (id(value), name)
         if key in self.positions:
             self.hash.update(f"<again {self.positions[key]}>".encode())
@@ -159,7 +159,7 @@ def globals_of(function: Any) -> dict[str, Any]:
 
 
 def reachable_names(function: Any, seen: set[int] | None = None) -> set[str]:
-    """Return the names of all globals and attributes in a function and its compiled helpers; `seen`: ids to skip."""
+    """Return the names of globals and attributes in a function and its helpers; skip functions with ids in `seen`."""
     seen = set() if seen is None else seen
     seen.add(id(function))
     names = names_of_code(function.__code__)
@@ -205,7 +205,7 @@ class FrozenValue(NamedTuple):
 
 
 class _LoadedName(NamedTuple):
-    """Global (closure variable if `free`) that a code object loads, and the attributes that it loads from it."""
+    """Name of a global (if `free`, of a closure variable) that code loads; `attributes`: ("b", "c") for name.b.c."""
 
     free: bool
     name: str
@@ -232,7 +232,7 @@ def _array_bytes(value: Any) -> bytes | None:
 def frozen_locations(function: Any, seen: set[int] | None = None) -> Iterator[FrozenValue]:
     """Yield the values in a function and its helpers that become part of machine code, such as numbers and arrays.
 
-    Omit values in functions of twoloop, which never change; but search helpers that these functions call.
+    Omit values in twoloop's functions, which never change, but search their helpers. `seen`: ids of values to skip.
     """
     seen = set() if seen is None else seen
     if id(function) in seen:
@@ -271,7 +271,7 @@ def _is_frozen(value: Any) -> bool:
 
 
 def _value_and_items(location: FrozenValue, seen: set[int]) -> Iterator[FrozenValue]:
-    """Yield a value; if it is a tuple, also yield its items that can change: arrays, functions and tuples."""
+    """Yield a value. If it is a tuple whose id is not in `seen`, also yield its arrays, functions and tuples."""
     yield location
     if not isinstance(location.value, tuple) or id(location.value) in seen:
         return
@@ -338,7 +338,7 @@ class FunctionCopier:
     """Copy functions; in copies, replace the compiled helpers in globals, defaults and closure variables.
 
     `wrap(copy, original)` returns the replacement of the helper `original`; `copy` is a copy of its Python function.
-    After this call, helpers that `copy` uses are replaced, too.
+    The helpers that `copy` uses are replaced only after `wrap` has returned.
     """
 
     def __init__(self, wrap: Callable[[types.FunctionType, Any], Any]):
@@ -346,7 +346,7 @@ class FunctionCopier:
         self.copies: dict[Any, Any] = {}
 
     def replacement_of(self, value: Any, names: frozenset[str] = frozenset()) -> Any:
-        """Return the replacement of a value, if any, else the value; in a module, replace the attributes `names`."""
+        """Replace a helper, the items of a tuple, or the attributes `names` of a module; return any other value."""
         if self.is_copied(value):
             if id(value) not in self.copies:
                 self._add_copy(value)
@@ -385,7 +385,7 @@ class FunctionCopier:
         own_globals = dict(function.__globals__)
         copy = types.FunctionType(function.__code__, own_globals, function.__name__, function.__defaults__, cells)
         copy.__kwdefaults__, copy.__qualname__ = function.__kwdefaults__, function.__qualname__
-        self.copies[id(helper)] = self.wrap(copy, helper)  # stored now: `copy` may use the helper itself
+        self.copies[id(helper)] = self.wrap(copy, helper)  # before the next lines: the helper may call itself
         for name in used_names & set(own_globals):
             own_globals[name] = self.replacement_of(own_globals[name], names)
         if function.__defaults__ is not None:

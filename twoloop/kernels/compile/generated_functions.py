@@ -145,7 +145,7 @@ def _target_triple() -> str:
 
 def _new_target_machine() -> Any:
     """Return a new LLVM target machine for the processor for which numba compiles; engines cannot share one."""
-    options: dict[str, Any] = {"opt": 1}  # level 2 takes a quarter longer, and code without branches gains nothing
+    options: dict[str, Any] = {"opt": 1}  # level 2 compiles a quarter longer; code without branches gains no speed
     cpu_target.target_context.codegen()._customize_tm_options(options)
     return binding.Target.from_triple(_target_triple()).create_target_machine(**options)
 

@@ -58,7 +58,7 @@ def jitable_templates(function: Any) -> list[Any]:
         return []
     closures = [getattr(getattr(each, "_overload_func", None), "__closure__", None) for each in templates]
     is_own = [any(cell.cell_contents is function for cell in source or ()) for source in closures]
-    return templates if all(is_own) else []  # [] if numba calls another implementation in place of the function
+    return templates if all(is_own) else []  # []: numba would compile another function in place of this one
 
 
 def add_signature(function: Dispatcher, signature: Any) -> None:
@@ -205,7 +205,7 @@ _LOCK_EVENTS = ("numba:llvm_lock", "numba:compiler_lock")  # kinds of events tha
 
 
 def _skip_lock_events(report: Any) -> Any:
-    """Return a function that reports events as `report` does, but omits those of locks: thousands for each kernel."""
+    """Return a function that passes events to `report`, except those of locks: each kernel causes thousands of them."""
     return lambda kind, *args, **named: None if kind in _LOCK_EVENTS else report(kind, *args, **named)
 
 
@@ -312,7 +312,6 @@ class _Compiler(Compiler):
     """Numba's compiler without the passes in _SKIPPED_PASSES."""
 
     def define_pipelines(self) -> list[Any]:
-        """Return numba's lists of compiler passes without those in _SKIPPED_PASSES."""
         pipelines: list[Any] = super().define_pipelines()
         for pipeline in pipelines:
             pipeline.passes = [each for each in pipeline.passes if each[0] not in _SKIPPED_PASSES]

@@ -49,13 +49,13 @@ class Reference(types.Type):
         _REFERENCES[name] = self
         self.arrays = dict(arrays)
         self.dtypes = {field: as_dtype(kind.dtype) for field, kind in self.arrays.items()}
-        # for each element that is an attribute, by its name: the field of its array, and its index
+        # by name of an element: the field of the array that contains the element, and the element's index in this array
         self.elements = {element: (array, i) for array, named in elements.items() for element, i in named.items()}
         self.functions: dict[str, Signature] = {}
-        self.llvm_functions: set[str] = set()  # those names in `functions` that belong to generated functions
+        self.llvm_functions: set[str] = set()  # keys of `functions` that name generated functions
         self.offsets: dict[str, int] = {}
         self.n_words = 0
-        self._addresses: Any = BoundedCache()  # addresses by tuple of functions; a cache, because finding them is slow
+        self._addresses: Any = BoundedCache()  # addresses of machine code, by tuple of functions
         for field, kind in self.arrays.items():
             self.offsets[field] = self.n_words
             self.n_words += 1 + kind.ndim
@@ -73,7 +73,7 @@ class Reference(types.Type):
         return f"{self.name}-{hashlib.sha256(repr(fields).encode()).hexdigest()[:16]}"
 
     def add_function(self, field: str, signature: Signature) -> None:
-        """Add a field for a function compiled by numba; its arguments may be of this type, too."""
+        """Add a field for a function compiled by numba; arguments of the function may have this type."""
         self.functions[field] = signature
         self.offsets[field] = self.n_words
         self.n_words += 1
@@ -82,7 +82,7 @@ class Reference(types.Type):
     def add_llvm_functions(self, signatures: Mapping[str, Signature]) -> None:
         """Add fields for generated functions; `signatures`: signature of each function, by field.
 
-        A structure may lack such functions (address 0): a kernel must check this before it calls one.
+        A structure may lack such a function (address 0): a kernel must compare the address with 0 before a call.
         """
         for field, signature in signatures.items():
             self.functions[field] = signature
@@ -217,7 +217,7 @@ def _load_array(context: Any, builder: Any, typ: Any, pointer: Any, field: str) 
     }
     model = context.data_model_manager[kind]
     array = ir.Constant(context.get_value_type(kind), ir.Undefined)
-    for name, value in fields.items():  # keeps the values in registers; numba's own function would use memory
+    for name, value in fields.items():  # keeps the array in registers; numba's own function would use memory
         index = model.get_field_position(name)
         element = ir.Constant(array.type.elements[index], None) if value is None else value
         array = builder.insert_value(array, element, index)
@@ -225,7 +225,7 @@ def _load_array(context: Any, builder: Any, typ: Any, pointer: Any, field: str) 
 
 
 def _define_call(typ: Reference, field: str, signature: Signature) -> None:
-    """Define the code of calls of the function in a field of a `Reference`, if the function is compiled by numba."""
+    """Define the code that calls the function in a field of a `Reference`, for a function compiled by numba."""
     offset = typ.offsets[field]
 
     @lower_builtin((typ.name, field), typ, *signature.args)
@@ -253,7 +253,7 @@ def _llvm_type(kind: Any) -> Any:
 
 
 def _define_llvm_call(typ: Reference, field: str, signature: Signature) -> None:
-    """Define the code of calls of the function in a field of a `Reference`, if the function is generated."""
+    """Define the code that calls the function in a field of a `Reference`, for a generated function."""
     offset = typ.offsets[field]
 
     @lower_builtin((typ.name, field), typ, *signature.args)

@@ -37,14 +37,14 @@ HIGHEST, INNER_TOL, OUTER_TOL, N_OPTION_SCALARS = range(4)
 (
     HAS_TRIAL,  # 1: the last attempt has stored the differences at the end of its step
     ORDER,  # order of the next attempt
-    DEPTH,  # highest order of a difference in the history
+    DEPTH,  # order of the highest difference in the history
     AGE,  # number of accepted steps since the last change of order or the last rejected step
     NEXT_ORDER,  # value of ORDER after the attempted step
     NEXT_DEPTH,  # value of DEPTH after the attempted step, if it is accepted
     N_MEMORY_SCALARS,
 ) = range(7)
 # indices of the rows of coefficients in `memory`. SPANS: times (s) from earlier states of the history to the last one.
-# NEW_SPANS: times (s) from all states of the history to the end of the step. ERROR_CONSTANTS: one for each order from 0
+# NEW_SPANS: times (s) from all states of the history to the end of the step. ERROR_CONSTANTS: by order, from 0
 SPANS, NEW_SPANS, ERROR_CONSTANTS, N_ROWS = range(4)
 
 
@@ -195,7 +195,7 @@ def _correct_state(f, w, options, t, c, prediction, rate, new_state, a_new):
 
 @compiled
 def _difference_norm(tolerances, y, y1, d, sign, difference):
-    """Return the largest |d + sign * difference| / (atol + rtol max(|y|, |y1|)) of positions and velocities."""
+    """Return the largest |d + sign * difference| / (atol + rtol max(|y|, |y1|)); y, y1, d: see `_choose_order`."""
     n_q = d.size // 2
     largest = 0.0
     for m in range(d.size):
@@ -206,14 +206,14 @@ def _difference_norm(tolerances, y, y1, d, sign, difference):
 
 @compiled
 def _choose_order(options, memory, tolerances, trial, y, y1, d):
-    """Store NEXT_ORDER; return the error, in tolerances, and the ratio of the next step size to this one.
+    """Store NEXT_ORDER; return the error estimate, in tolerances, and the ratio of the next step size to this one.
 
-    y and y1 are (q, v) at the beginning and at the end of the step; d is y1 minus its prediction.
+    y, y1: (q, v) at the beginning and at the end of the step. d: y1 minus its prediction. `trial`: scaled differences.
     """
     k, depth = int(memory[ORDER]), int(memory[DEPTH])
     spans, constants = _coefficient_row(memory, NEW_SPANS), _coefficient_row(memory, ERROR_CONSTANTS)
     norm = ERROR_FACTOR * _difference_norm(tolerances, y, y1, d, 0.0, d)
-    # with unequal steps, interpolation of the history causes a second error; as in DASSL, the larger one of both counts
+    # if steps are unequal, interpolation of the history causes a second error; as in DASSL, the larger of both counts
     interpolation_error = spans[0] / spans[k]
     for j in range(k):
         interpolation_error += spans[0] / spans[j] - 1.0 / (j + 1.0)
@@ -285,8 +285,7 @@ def _gauss_step(f, w, options, tolerances, t, h, state, new_state, scratch):
 def bdf_step(f, w, options, memory, t, h, tolerances, state, new_state):
     """Attempt a step: predict from the history, correct, and choose the order and the size of the next step.
 
-    If the step size is fixed, the order is HIGHEST; before, the first HIGHEST steps are Gauss steps, which fill the
-    history.
+    If the step size is fixed, the order is options[HIGHEST]; the same number of Gauss steps fills the history before.
     """
     n = w.Q.size
     differences, trial, prediction, rate, scratch = _history_views(memory, n)

@@ -49,8 +49,8 @@ def commit_runge_kutta(f, w, options, memory, tolerances, accepted):
 def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
     """Attempt a step by fixed-point iteration; estimate its error from a step of size h and two steps of size h/2.
 
-    The new state is the end of the second half step. If EXTRAPOLATION is not 0, the difference from the end of the
-    whole step serves to extrapolate this state, which is then projected onto the constraints. The polynomial through
+    The new state is the end of the second half step. If options[EXTRAPOLATION] is not 0, it is extrapolated from the
+    ends of the whole step and of the half steps, and projected onto the constraints. The polynomial through
     the stage accelerations of the last accepted step predicts the stages of the whole step; the polynomial of the whole
     step predicts the stages of the half steps. If the step size is fixed, only the whole step is computed.
     """
@@ -92,7 +92,7 @@ def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
         )
         if code != DONE:
             return Attempt(code, np.inf, 0.0)
-        # the end of the whole step is discarded, and with it the error of its predicted positions
+        # take the larger value of the half steps; that of the whole step does not count, because its end is discarded
         prediction_error = max(prediction_error, prediction_error_mid)
         code, error = estimate_and_extrapolate(
             f, w, options[EXTRAPOLATION], options[INNER_TOL], t + h, tolerances, q, v, q_full, v_full, q1, v1
@@ -110,7 +110,7 @@ def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
 RUNGE_KUTTA = Step(runge_kutta_step, commit_runge_kutta)
 
 
-SUDDEN_ERROR = 10.0  # a step with a larger estimated error by a jump of a force is rejected; not in the paper
+SUDDEN_ERROR = 10.0  # a step is rejected if `jump_error` (in tolerances) is larger; not in the paper
 
 
 @kernel(ATTEMPT)

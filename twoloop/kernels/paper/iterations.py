@@ -20,7 +20,7 @@ from twoloop.kernels.steps.stages import INNER_TOL, OUTER_TEST, OUTER_TOL, table
 # in steps of fixed size are compensated for these errors, because otherwise the energy of symmetric methods drifts
 N_ROUNDING = 4
 
-# indices of the scalars in `memory`: 1 if a step was attempted, and its size (s); the same for the last accepted step
+# indices of scalars in `memory`: 1 if a step was attempted, and the step's size (s); the same of the last accepted step
 HAS_TRIAL, H_TRIAL, HAS_PREVIOUS, H_PREVIOUS, N_MEMORY_SCALARS = range(5)
 # indices of the blocks (s, n_q) in `memory`, with a row for each stage: accelerations in the last accepted step, in the
 # attempted step, and in a half step; positions and velocities
@@ -116,12 +116,12 @@ def _clear_rounding_errors(coordinates, rounding):
 
 @compiled
 def iterate_accelerations(f, w, options, tolerances, t, h, q, v, A_stage, Q_stage, V_stage, q1, v1, rounding):
-    """Compute a step of size h from (q, v) by iteration on stage accelerations; return a code and a `prediction_error`.
+    """Compute a step of size h from (q, v) by iterating on stage accelerations; return a code and `prediction_error()`.
 
     A_stage (s, n) contains predicted accelerations on entry, and the solution on return; (q1, v1) becomes the end of
     the step, on the constraints. The stages Q_j = q + c_j h v + h^2 sum_k (A A)_jk a_k and V_j = v + h sum_k A_jk a_k,
-    with the tableau A, c, then satisfy eq. (17) of the paper. For undamped systems, one iteration reduces errors as
-    much as two iterations by `iterate_first_order`. Sums are compensated if `rounding` has rows.
+    with the tableau A, c, then satisfy eq. (17) of the paper. For undamped systems, an iteration gains as much accuracy
+    as two iterations by `iterate_first_order`. Sums are compensated if `rounding` has rows.
     """
     s, A, A2, b, bA, c = tableau_of(options)
     n = q.size

@@ -9,15 +9,15 @@ from twoloop.kernels.evaluation.inner_loop import evaluate_state, rounding_floor
 from twoloop.kernels.linalg.dense import copy
 
 MAX_ITERATIONS = 60  # number of fixed-point iterations after which a step has failed
-# if a step increases the largest |coordinate| by more than this factor, _motion_rate assumes a start at the origin
+# if a step increases the largest |coordinate| by more than this factor, `_motion_rate` returns at most 1 / `gap`
 GROWTH_AFTER_REST = 2.0
 TINY = 1e-300  # added to the allowed error of a step, which may be 0 for a mechanism at rest at the origin
 
 # indices in `memory`: largest |coordinate|, |velocity| and |acceleration| so far. The new accelerations (n_q) follow
 SIZE, SPEED, ACCELERATION, N_MEMORY_SCALARS = range(4)
 
-# indices in `options`: parameters of Newmark's method, tolerances of inner and outer loop. ERROR_TOL: tolerance of the
-# error as measured in the paper; 0: measure it otherwise, see _estimated_error
+# indices in `options`: parameters of Newmark's method, tolerances of inner and outer loop. ERROR_TOL: tolerance
+# for the norm by which the paper measures the error estimate; 0: `_estimated_error` uses atol and rtol instead
 BETA, GAMMA, INNER_TOL, OUTER_TOL, ERROR_TOL, N_OPTIONS = range(6)
 
 
@@ -34,7 +34,7 @@ def _motion_rate(memory, gap, q, v, a, q1, v1, a1):
 
     The time follows from the largest |coordinate|, |velocity| and |acceleration| so far: at a single time, all
     coordinates may be near zero, depending on the origin. If the largest |coordinate| arises mainly in this step, as it
-    does after rest at the origin, the time is at least `gap` (s).
+    does after rest at the origin, the time is at least `gap` (s), the longest allowed time between two evaluations.
     """
     memory[SIZE] = _largest_abs(q, memory[SIZE])
     memory[SPEED] = _largest_abs(v, memory[SPEED])
@@ -50,9 +50,9 @@ def _motion_rate(memory, gap, q, v, a, q1, v1, a1):
 def _estimated_error(options, tolerances, rate, h, q, v, a, a1):
     """Return the estimated error of a step, in units of the tolerances; `rate` (1/s) is the result of `_motion_rate`.
 
-    The leading local error of q for the parameter gamma = 1/2 is e = |beta - 1/6| h^2 |a1 - a|. The result is the
-    largest component of (e / h) / (rate atol + rtol |v|). This error per unit time is of order h^2, like the error of
-    the run. If ERROR_TOL > 0, the result is the 2-norm of e divided by ERROR_TOL (err_out in the paper).
+    The leading local error of q for the parameter gamma = 1/2 is e = |beta - 1/6| h^2 |a1 - a|, with the accelerations
+    a and a1 at both ends. The result is the largest component of (e / h) / (rate atol + rtol |v|); the error e / h per
+    unit time is of order h^2, like that of the run. If ERROR_TOL > 0, it is |e|_2 / ERROR_TOL (err_out in the paper).
     """
     factor = abs(options[BETA] - 1.0 / 6.0) * h
     total = 0.0

@@ -24,7 +24,7 @@ HIGHEST = 12  # largest order, as in Shampine and Gordon's STEP; the quadrature 
 N_TERMS = HIGHEST + 2  # number of stored differences of accelerations, and of their coefficients for v and for q
 ERROR_FACTOR = 5.0  # factor on the error estimate, because the errors of many short steps add up
 SAFETY = 0.8  # safety factor: ratio of the next step size to the size for which the error would equal the tolerance
-GROWTH, SHRINKAGE = 1.2, 0.5  # largest and smallest ratio of successive step sizes
+GROWTH, SHRINKAGE = 1.2, 0.5  # largest ratio of successive step sizes, and smallest after a rejection
 START_GROWTH = 2.0  # largest ratio of successive step sizes while the order still rises with every step
 LEAST_FACTOR = 0.1  # smallest ratio of successive step sizes after a large error of predicted dependent positions
 RESTART_AFTER = 3  # number of successive rejected steps after which the method restarts with order 1
@@ -37,7 +37,7 @@ POSITION_WEIGHTS = WEIGHTS * (1.0 - NODES)  # weights of the values c_i(s) at NO
 def _error_constants():
     """Return |g_k - g_{k+1}| at equal steps for each order k from 0 to HIGHEST (g: coefficients for velocities).
 
-    The estimate of the velocity error is h |g_k - g_{k+1}| d, where d is the error of the predicted accelerations.
+    The estimate of the velocity error is h |g_k - g_{k+1}| d, where d is evaluated minus predicted accelerations.
     """
     coefficients = np.ones(HIGHEST + 1)
     for k in range(1, HIGHEST + 1):
@@ -168,12 +168,12 @@ def _compute_coefficients(memory, h, k):
 
 @merged
 def _predict_state(memory, h, k, old, new, state, q1, v1, n):
-    """Predict the state (q1, v1) from the differences in the table `old`; store predicted differences in `new`."""
+    """Predict (q1, v1) after a step of size h at order k from the table `old`; store predicted differences in `new`."""
     beta, g, G = _row(memory, BETA), _row(memory, G_VELOCITY), _row(memory, G_POSITION)
     mean_v, mean_q = _scratch_rows(memory, n)
     for m in range(0, old.shape[1], 4):
         d0, d1, d2, d3 = old[N_TERMS, m], old[N_TERMS, m + 1], old[N_TERMS, m + 2], old[N_TERMS, m + 3]
-        # row k + 1 becomes -beta_{k+1} phi_{k+1} = phi_{k+2} - d; the error d of the prediction will be the last row
+        # old[k] + d0 is a difference, see `_difference_table`; row k + 1 of `new` serves the estimate at order k + 1
         b = beta[k]
         new[k + 1, m] = -b * (old[k, m] + d0)
         new[k + 1, m + 1] = -b * (old[k, m + 1] + d1)
@@ -233,11 +233,11 @@ def _estimate_error(g, G, h, order, largest_v, largest_q):
 
 @merged
 def _choose_order(memory, h, k, table, d, n):
-    """Store NEXT_ORDER; return the error, in units of the tolerances, and the ratio of the next step size to h.
+    """Store NEXT_ORDER; return the estimated error, in tolerances, and the ratio of the next step size to h.
 
-    The rules are taken from STEP (Shampine and Gordon). The order k decreases if the error at lower orders is not
-    larger. It increases if k + 1 steps had the order k and the error at order k + 1 is smaller. While STARTING is 1, it
-    increases in every step. `table`: predicted differences; `d`: error of the predicted accelerations.
+    The rules are taken from STEP (Shampine and Gordon). The order k decreases if the estimates at lower orders are not
+    larger. It increases if k + 1 steps had the order k and the estimate at order k + 1 is smaller. While STARTING is 1,
+    it increases in every step. `table`: predicted differences; `d`: evaluated minus predicted accelerations.
     """
     g, G = _row(memory, G_VELOCITY), _row(memory, G_POSITION)
     weight_v, weight_q = _scratch_rows(memory, n)

@@ -6,8 +6,8 @@ collocation at Gauss nodes whose stages are projected onto the constraints. Then
 motion, and the fixed-point iteration converges as it does elsewhere.
 
 - At a relative distance s from the position (a ratio of pivots), rounding errors are eps/s in positions, eps/s^2 in
-  velocities and eps/s^3 in accelerations. Nodes with too large rounding errors are left out: their accelerations are
-  interpolated from the nodes on both sides, because the motion through the position is analytic.
+  velocities and eps/s^3 in accelerations (eps: machine epsilon). Nodes with too large rounding errors are left out:
+  their accelerations are interpolated from nodes on both sides, because the motion through the position is analytic.
 - The result depends on q and v at the beginning only: the accelerations there may consist of rounding errors.
 - The end of the step is projected onto the constraints with a partition chosen there.
 - The generated code of the mechanism projects the stages. If there is no generated code, or if its pivots are too
@@ -26,7 +26,7 @@ from twoloop.kernels.evaluation.inner_loop import evaluate_state, project, renew
 from twoloop.kernels.linalg.dense import copy, sum_rows
 from twoloop.kernels.steps.stages import lagrange_values
 
-# indices of the scalars in `options`, followed by A, A @ A and Legendre coefficients (S, S each), b, b @ A, c (S each)
+# indices of scalars in `options`. The Gauss tableau follows: A, A @ A, Legendre weights (S, S each), b, b @ A, c (S)
 INNER_TOL, THETA, N_SCALARS = range(3)
 S = 20  # number of Gauss nodes, which are the stages
 # the iteration has converged when a sweep changes accelerations by at most CONVERGED_CHANGE tolerances
@@ -48,15 +48,16 @@ SHORTEST_PIECE, LONGEST_PIECE = 0.05, 0.2
 # longest time between two evaluations if all nodes are evaluated, relative to the duration of the polynomial
 NODE_GAP = 0.0767
 BACKWARD_FRACTION = 0.4  # duration of the polynomial before the beginning of the step, relative to its whole duration
-ORDER, ERROR_FACTOR = 12.0, 0.5  # order of the estimated error in the step size, and factor on the error estimate
-# factor on the largest change of a stage by its projection, which counts as an error of the step
+ORDER, ERROR_FACTOR = 12.0, 0.5  # the error estimate is about proportional to h^ORDER; factor on the estimate
+# if a projection changes a stage by x tolerances, the error estimate of the step is at least PROJECTION_WEIGHT x
 PROJECTION_WEIGHT = 0.5
 ROUNDING = 1e-13  # relative tolerance of the iteration in steps of fixed size, and of comparisons of times
-MIN_PIVOT_RATIO = 0.5  # smallest allowed ratio of the pivot at the end of a step to the pivot at the beginning
-END_MARGIN = 2.0  # smallest ratio of the pivot at the end to the limit below which nodes are left out
-FAR_END = 0.3  # the end of a step is far from the singular position if the pivot is this fraction of the largest
+MIN_PIVOT_RATIO = 0.5  # a step fails if the pivot at its end is below this * pivot at its beginning; see FAR_END
+END_MARGIN = 2.0  # a step fails if the pivot at its end is below this * limit of pivots of evaluated nodes; see FAR_END
+FAR_END = 0.3  # these two limits do not apply if the pivot at the end is at least this * largest pivot of the run
 LATE = S - 4  # node near the end: if the pivot is larger there than at the end, the end is before the singular position
-# error and factor returned with a new polynomial: the repeated step takes a piece of this polynomial
+# an attempt that computes a polynomial returns this as error and as ratio of the next step size. As the error is above
+# 1, the step is repeated, and takes a piece of the polynomial
 REPEAT_FACTOR = 2.0
 TINY = 1e-300  # lower bound of divisors that may be zero
 
@@ -78,9 +79,9 @@ def begin_polynomial(memory, largest_pivot, earliest, may_approach, node_distanc
 
     `largest_pivot` is the largest pivot of the run so far; no node may lie before the time `earliest` (s). If
     `may_approach`, the polynomial may end before the singular position, nearer to it than it begins. `node_distance`
-    multiplies the distance from the position below which nodes are left out. The polynomial goes through q and v of
-    `base`, the time (s) and state [q, v, ...] of an earlier step that was farther from the singular position; without
-    `base`, through q and v at the beginning of the step.
+    is a factor on the pivot below which nodes are left out. `base` is the time (s) and the state [q, v, ...] of an
+    earlier step, farther from the singular position: the polynomial goes through its q and v. If `base` is None, the
+    polynomial goes through q and v at the beginning of the step.
     """
     stored = memory[-N_STORED:]
     stored[:] = np.nan
@@ -94,8 +95,8 @@ def begin_polynomial(memory, largest_pivot, earliest, may_approach, node_distanc
 def piece_ends(memory, c, t):
     """Return the times (s) after t at which the pieces of the polynomial in `memory` end.
 
-    Pieces end at END, at evaluated nodes next to a node that is left out, and at evaluated nodes where the piece would
-    otherwise be longer than LONGEST_PIECE. No piece is shorter than SHORTEST_PIECE.
+    Pieces end at the end of the polynomial, at evaluated nodes next to a node that is left out, and at evaluated nodes
+    where the piece would otherwise be longer than LONGEST_PIECE. No piece is shorter than SHORTEST_PIECE.
     """
     stored = memory[-N_STORED:]
     left_out = memory[-N_STORED - 3 * S : -N_STORED - 2 * S] < 0.0
@@ -121,10 +122,10 @@ def _velocity_weight(tolerances, m, n, h, state):
 
 @compiled
 def _estimate_error(tolerances, h, state, legendre, a, n_kept):
-    """Return the error of a step, in units of the tolerances, estimated from the last Legendre coefficients.
+    """Return an estimate of the error of a step, in tolerances, by the last Legendre coefficients of accelerations.
 
-    They are coefficients of the accelerations a (S, n), and estimate the error as in collocation_code.py. `n_kept`:
-    number of nodes that are not left out; coefficients of degree `n_kept` or higher are rounding errors.
+    Row k of `legendre` gives coefficient k of the accelerations a (S, n). The formula is that of collocation_code.py.
+    `n_kept`: number of nodes that are not left out; coefficients of degree `n_kept` or higher are rounding errors.
     """
     n, largest = a.shape[1], 0.0
     for m in range(n):
@@ -149,7 +150,7 @@ def _estimate_error(tolerances, h, state, legendre, a, n_kept):
 
 @merged
 def _integrate_polynomial(h, c, A, AA, a, q, v, q_end, v_end):
-    """Set q_end and v_end to the state at the time c h after the beginning of the polynomial.
+    """Set q_end and v_end to the state at the time c h after the beginning of the polynomial of duration h.
 
     (q, v): state at the beginning; A, AA (S): weights of the accelerations a (S, n) in their first and second integral.
     """
@@ -162,7 +163,7 @@ def _integrate_polynomial(h, c, A, AA, a, q, v, q_end, v_end):
 
 @compiled
 def _widest_gap(c, c0, kept):
-    """Return the longest part of [c0, 1] without an evaluated node (kept >= 0), as a fraction of the polynomial."""
+    """Return the widest gap in [c0, 1] between evaluated nodes: those of the nodes c for which kept >= 0."""
     widest, before = 0.0, c0
     for k in range(S):
         if kept[k] >= 0.0 and c[k] > c0:
@@ -174,10 +175,11 @@ def _widest_gap(c, c0, kept):
 def _choose_partition_at_end(
     f, w, t, h, stored, min_pivot, min_node_pivot, tables, a, q_0, v_0, q_late, v_late, q1, v1
 ):
-    """Set (q1, v1) to the end of the polynomial of duration h, at the time t; choose the partition; return a code.
+    """Set (q1, v1) to the end (at time t) of the polynomial of duration h; choose the partition there; return a code.
 
-    The code is SINGULAR if the end is too close to the singular position: the pivot is below FAR_END times the largest
-    and below `min_pivot`, or the end is before the position or below END_MARGIN times `min_node_pivot`.
+    The code is SINGULAR if the end is close to the singular position, or before it: its pivot is below FAR_END times
+    the largest pivot, and below a second limit. This limit is `min_pivot`; if MAY_APPROACH is 0, it is the largest of
+    `min_pivot`, END_MARGIN times `min_node_pivot`, and the pivot at the node LATE. (q_late, v_late): scratch.
     """
     A, AA, b, bA, c = tables
     if stored[MAY_APPROACH] == 0.0:
@@ -191,7 +193,7 @@ def _choose_partition_at_end(
 
 @compiled
 def _fill_integral_weights(b, c, c0, weights_v, weights_q):
-    """Store the weights (S) of accelerations in their integral (weights_v) and double integral (weights_q) to c0."""
+    """Store the weights (S) of accelerations at nodes c in their integral and double integral up to the time c0."""
     weights_v[:] = 0.0
     weights_q[:] = 0.0
     for i in range(S):
@@ -216,7 +218,7 @@ def _set_beginning_state(h, c0, weights_v, weights_q, a, q, v, q_0, v_0):
 
 @compiled
 def _interpolate(x, c, nodes, a, value):
-    """Set `value` (n) to the value at x of the polynomial through the accelerations a (S, n) at `nodes` (-1: none)."""
+    """Set `value` (n) to the value at x of the polynomial through a[k] (n) at c[k], for all k >= 0 in `nodes`."""
     value[:] = 0.0
     for node in nodes:
         if node >= 0:
@@ -334,7 +336,7 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
     last_0, last_1, last_2 = -1, -1, -1  # the last evaluated nodes, from which the first sweep extrapolates; -1: none
     for sweep in range(MAX_SWEEPS):
         change, largest_move = 0.0, 0.0
-        chooses_nodes = sweep in (0, 2, FEW_SWEEPS)  # whether this sweep decides anew which nodes are left out
+        chooses_nodes = sweep in (0, 2, FEW_SWEEPS)  # True: this sweep chooses anew which nodes are left out
         if chooses_nodes:
             n_kept = S
         if is_estimated and chooses_nodes and sweep == FEW_SWEEPS:
@@ -360,7 +362,7 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
             if chooses_nodes:
                 code = renew_partition(f, w, time, q_stage)
                 kept[j] = j
-                if code == DONE:  # in a run that begins near a singular position, earlier pivots may all be small
+                if code == DONE:  # if the run began near a singular position, this pivot may be the largest
                     stored[LARGEST_PIVOT] = largest_pivot = max(largest_pivot, w.pivot)
                 if is_estimated and (code != DONE or w.pivot < min_node_pivot * largest_pivot):
                     kept[j], n_kept, code = -1.0, n_kept - 1, DONE
@@ -403,7 +405,7 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
             has_converged = True
             break
         _set_beginning_state(duration, c_base, weights_v, weights_q, a, q_base, v_base, q_0, v_0)
-        # test the end of the step early: it is accurate enough after two sweeps, and most failing steps fail here
+        # test the pivot at the end already after two sweeps: the end is accurate enough, and most failures occur here
         if sweep == 1 and is_estimated:
             min_pivots = MIN_PIVOT_RATIO * pivot, min_node_pivot * largest_pivot
             code = _choose_partition_at_end(f, w, t + h, duration, stored, *min_pivots, tables, a, *states)

@@ -54,7 +54,6 @@ MAX_ASYMMETRY = 1e-12
 
 @compiled
 def _is_symmetric(A):
-    """Return whether the matrix A is symmetric up to rounding errors, see MAX_ASYMMETRY."""
     largest, asymmetry = 0.0, 0.0
     for i in range(A.shape[0]):
         largest = max(largest, abs(A[i, i]))
@@ -67,7 +66,7 @@ def _is_symmetric(A):
 def _fill_newton_matrix(w, memory, n, m, z, H):
     """Store Newton's matrix T^T (M - z^2 K - z D) T in H (m^2 numbers, row by row); m: number of degrees of freedom.
 
-    M: mass matrix; K and D: derivatives of the forces by q and v; columns of T: velocities that the constraints allow.
+    z: step size times gamma. M: mass matrix. K, D: derivatives of forces by q and v. Columns of T: allowed velocities.
     """
     N, Kr, Dr = (
         matrix_storage(w, n, at.SYSTEMS),
@@ -85,7 +84,7 @@ def _fill_newton_matrix(w, memory, n, m, z, H):
 
 @compiled
 def factor_newton_matrix(w, memory, z):
-    """Factor T^T (M - z^2 K - z D) T with K and D, the derivatives of forces that were computed last; return a code."""
+    """Factor T^T (M - z^2 K - z D) T, z = gamma h, with the derivatives of forces computed last; return a code."""
     n, m = w.Q.size, w.independent.size
     storage = matrix_storage(w, n, at.FILTER)
     H = as_matrix(storage, m)
@@ -105,7 +104,7 @@ def factor_newton_matrix(w, memory, z):
 def compute_and_factor_matrix(f, w, memory, t, q, v, z):
     """Compute K and D, the derivatives of forces, at (t, q, v), and factor T^T (M - z^2 K - z D) T; return a code.
 
-    The last evaluation must have been at (t, q, v), and w.lam must be the multipliers there.
+    The last evaluation must have been at (t, q, v), w.lam must be the multipliers there. z: step size times gamma.
     """
     n = q.size
     m = w.independent.size
@@ -162,7 +161,7 @@ def correct_stage(w, memory, residual, a):
 
 @compiled
 def filter_dense_error(w, memory, z, e_q, e_v):
-    """Filter e_v (n_dof) as `filter_error` of newton_systems.py does, by the factors of `factor_newton_matrix`."""
+    """Filter e_v, an error estimate of v, given e_q, that of q, as `filter_error` does; use `factor_newton_matrix`."""
     n = w.Q.size
     m = e_q.size
     N, Kr = as_matrix(matrix_storage(w, n, at.SYSTEMS), m), as_matrix(matrix_storage(w, n, at.DERIVATIVE_Q), m)
@@ -181,7 +180,7 @@ DIVERGENCE_RATIO = 2.0  # Newton's method has diverged if a correction exceeds t
 LINEAR_FACTOR = 0.01  # factor on Newton's tolerance if derivatives are differences: convergence is then only linear
 # derivatives computed by differences are renewed if a Newton correction exceeds this fraction of the previous one
 MAX_CONTRACTION = 0.1
-VELOCITY_WEIGHT = 0.1  # weight, in Newton's convergence test, of the position error that an error of velocities causes
+VELOCITY_WEIGHT = 0.1  # factor, in Newton's convergence test, on the deviation in q that an inaccurate v causes later
 
 
 @inlined
@@ -313,8 +312,8 @@ MAX_RATIO_BY_ONE_JUMP = 0.174
 def _filter_errors(f, w, options, memory, h, e_q, e_v):
     """Remove stiff components: replace (e_q, e_v) by (I - z J)^-1 (e_q, e_v), z = h gamma, using the last factors.
 
-    J is the Jacobian of velocities and accelerations by (q_i, v_i). The errors are the first n_dof entries of e_q and
-    e_v (n_q); the other entries are scratch.
+    J is the Jacobian of velocities and accelerations by (q_i, v_i). The estimated errors of q and v are the first n_dof
+    entries of e_q and e_v (n_q); the other entries are scratch.
     """
     z = h * gamma_of(options)
     n_dof = w.independent.size
@@ -328,7 +327,7 @@ def _filter_errors(f, w, options, memory, h, e_q, e_v):
 
 @compiled
 def _factor_filter(f, w, options, memory, h):
-    """Factor the matrix that `_filter_errors` needs for errors of steps of size h; return a code."""
+    """Factor the matrix that `_filter_errors` needs for steps of size h; return a code."""
     if has_dense_tangents(f, w):
         return factor_newton_matrix(w, memory, h * gamma_of(options))
     return factor_filter(f, w, options, memory, stages_at_once(options), h)
@@ -430,7 +429,7 @@ def _apply_embedded_formula(f, w, options, memory, h, q1, v1):
 
 @compiled
 def _error_in_slow_directions(f, w, options, memory, h, tolerances, state, new_state, A_stage):
-    """Return the effect, in tolerances, of the slowly changing part of the velocity error E_V, see newton_step.py.
+    """Return the effect, in tolerances, of the slow part of the estimated velocity error E_V, see newton_step.py.
 
     If the whole of E_V has an effect of at most 1, return 0. E_Q, E_V and the factors are overwritten.
     """

@@ -88,7 +88,7 @@ def _add_weighted_slopes(y, h, weights, slopes, total, y1):
 
 @compiled
 def largest_error(tolerances, y, y1, fine_error, coarse_error, strict):
-    """Return the error e^2 / sqrt(e^2 + d^2) of a step from y to y1 (2 n each), in units of the tolerances.
+    """Return the estimated error e^2 / sqrt(e^2 + d^2) of a step from y to y1 (2 n each), in units of the tolerances.
 
     e and d are the largest components of the error estimates `fine_error` and `coarse_error` (2 n, for positions and
     velocities), relative to atol + rtol |y|. The formula is not applied to each component separately: where d of a
@@ -114,7 +114,7 @@ def largest_error(tolerances, y, y1, fine_error, coarse_error, strict):
 
 @compiled
 def _estimate_error(tolerances, h, fine, coarse, y, y1, slopes, fine_error, coarse_error, strict):
-    """Return the error of a step from y to y1, in units of the tolerances; fill `fine_error` and `coarse_error`."""
+    """Return the estimated error of a step from y to y1, in tolerances; fill `fine_error` and `coarse_error`."""
     sum_rows(fine, slopes, fine_error)
     sum_rows(coarse, slopes, coarse_error)
     for m in range(y.size):
@@ -125,7 +125,7 @@ def _estimate_error(tolerances, h, fine, coarse, y, y1, slopes, fine_error, coar
 
 @kernel(ATTEMPT, vectorized=True)
 def explicit_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """Attempt a step of size h; if its error is above 1, do not compute the accelerations at its end."""
+    """Attempt a step of size h; if its estimated error is above 1, do not compute the accelerations at its end."""
     s, A, b, c, fine, coarse = tableau_of(options)
     n = w.Q.size
     q, v, y, y1 = state[:n], state[n : 2 * n], state[: 2 * n], new_state[: 2 * n]

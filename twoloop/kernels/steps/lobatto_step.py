@@ -4,8 +4,8 @@ As in the paper, a fixed-point iteration without a Jacobian solves for the stage
 The generated code of generate/collocation_code.py does the arithmetic; this module chooses the step size. (M. Antonana,
 J. Makazaga and A. Murua use such an iteration for ordinary differential equations at high precision, arXiv 2511.03655.)
 
-A sweep over the stages multiplies their error by the contraction rho, which increases with the step size and with the
-derivatives of the accelerations. The step size is limited in two ways:
+A sweep multiplies the distance of the stages from the solution by the contraction rho, which increases with the step
+size and with the derivatives of the accelerations. The step size is limited in two ways:
 
 - convergence: a target number of sweeps has to suffice;
 - accuracy: the last Legendre coefficients of the accelerations have to be as small as the tolerance requires.
@@ -53,30 +53,30 @@ from twoloop.kernels.linalg.dense import copy
     N_OPTIONS,
 ) = range(6)
 
-START_CONTRACTION = 0.12  # contraction (ratio of errors by a sweep) that guesses of the first step size aim at
+START_CONTRACTION = 0.12  # the first step size is guessed so that a sweep multiplies deviations of the stages by this
 MAX_GUESSES = 4  # largest number of guesses of the first step size
 FACTOR_AFTER_DIVERGENCE = 0.6  # ratio of the next step size to the size of a step whose iteration did not converge
 SAFETY = 0.75  # safety factor on the step size for which the estimated error would equal the tolerance
-MAX_LIMITED = 24.0  # another method takes over at this value of LIMITED, which counts steps limited by convergence
-MIN_CURVATURE = 0.1  # below this value of CURVATURE (in tolerances), accelerations hardly vary within a step
+MAX_LIMITED = 24.0  # another method takes over if data[LIMITED], a count of steps limited by convergence, reaches this
+MIN_CURVATURE = 0.1  # if data[CURVATURE] is below this (in tolerances), accelerations hardly vary within a step
 N_PIVOT_PARTS = 4  # number of equal parts of a step; the smallest pivot of C_q is computed where two parts meet
-MIN_PIVOT_RATIO = 0.4  # a singular position is near if a step reduces the smallest pivot of C_q below this fraction
+MIN_PIVOT_RATIO = 0.4  # another method takes over if a step reduces the smallest pivot of C_q below this fraction
 # if the smallest tolerance is below this, another method takes over once a singular position was near. Without this
 # rule, five more runs of the benchmark A02 (N-four-bar mechanism) end with wrong results
 TIGHT_TOLERANCE = 1e-8
-MAX_FAILURES = 12.0  # another method takes over at this value of FAILURES, to which a step without convergence adds 2
+MAX_FAILURES = 12.0  # another method takes over if data[FAILURES] reaches this; a step without convergence adds 2
 CHECKED_GAP = 0.0908  # longest time between evaluations at and between the nodes, relative to the step size
 # largest ratio of successive step sizes: GROWTH_EARLY in the first N_EARLY steps of a run, GROWTH in later steps
 N_EARLY, GROWTH_EARLY, GROWTH = 6, 4.0, 1.3
 GROWTH_ONE_SWEEP = 30.0  # replaces GROWTH_EARLY after a step that took only one sweep
 MIN_FACTOR = 0.4  # smallest ratio of the next step size to the size of an accepted step
-LEAST_TREND = 0.4  # lower bound of the trend, the ratio of step sizes that the error allows in successive steps
+LEAST_TREND = 0.4  # lower bound of `trend`, the ratio of the step sizes that the error estimates of two steps allow
 # step size that the convergence allows with two evaluations of accelerations in a sweep, relative to that with one
 GAIN_BY_REPEATS = 1.5
 # sweeps stop evaluating accelerations twice (REPEATS = 0) if the convergence allows steps this many times as long as
 # the error allows: the second evaluation then saves no time
 MAX_REACH = 2.5
-MAX_EXTRAPOLATION = 3.0  # limit of the step size that the error allows, as a multiple of the actual step size
+MAX_EXTRAPOLATION = 3.0  # the step size that the error estimate allows counts as at most this times the actual size
 _array_offsets = merged(array_offsets)
 
 
@@ -102,10 +102,10 @@ def _reuse_rejected_polynomial(f, data, state):
 
 @compiled
 def _solve_collocation(f, w, options, data, tolerances, t, h, state):
-    """Solve for the stages of a step of size h; return a code, the error, and the ratio of the next step size to h.
+    """Solve for the stages of a step of size h; return a code, an error estimate, and (next step size) / h.
 
-    The stages are stored in `data`; the error is in tolerances. Codes: CONVERGED, REJECTED (too large an error, or no
-    convergence), GUESSED (the first step size must be guessed again), NOT_COMPUTED (accelerations were not computed).
+    The stages are stored in `data`; the estimate is in tolerances. Codes: CONVERGED; REJECTED (estimate or defect too
+    large, or no convergence); GUESSED (guess the first step size again); NOT_COMPUTED (accelerations not computed).
     """
     is_first, is_estimated = data[field.PREDICTS] == 0.0, tolerances[ESTIMATE] == 1.0
     h_max = tolerances[DEFECT_GAP] / CHECKED_GAP
@@ -149,10 +149,10 @@ def _solve_collocation(f, w, options, data, tolerances, t, h, state):
         max_factor = min(max_factor, factor_by_defect)
     max_factor = min(max_factor, h_max / h)
     extra_sweeps = data[field.SWEEPS] - data[field.N_TARGET]
-    # the motion may be stiff if accelerations hardly vary, but a step takes at least N_TARGET - 1 sweeps
+    # the motion may be stiff if accelerations hardly vary, but a step takes at least the target of sweeps minus 1
     is_limited = data[field.CURVATURE] < MIN_CURVATURE and extra_sweeps >= -1.0
     data[field.LIMITED] = max(0.0, data[field.LIMITED] + (1.0 if is_limited else -1.0))
-    # extrapolate the step size that the error allows by its last change, because such changes vary little between steps
+    # `trend`: ratio of the step sizes that the estimates in this and in the last step allow; the next ratio is similar
     h_allowed = h * min(data[field.FACTOR_OF_ERROR], MAX_EXTRAPOLATION)
     if error > 1e-6 and data[field.CURVATURE] >= MIN_CURVATURE:
         trend = 1.0 if is_first else min(max(h_allowed / data[field.ALLOWED_H], LEAST_TREND), 1.0)
@@ -307,7 +307,7 @@ def _adopt_projection(f, w, options, data, tolerances, driven, n, k, t, row, sta
 
 @merged
 def _can_take_next_step(w, data, tolerances, control, clock, h):
-    """Return whether a step of size h may follow now, although the integrator has not checked the last step yet."""
+    """Return True if a step of size h may follow now, although the integrator has not checked the last step yet."""
     h_long = clock[at.H_LONG]
     if h <= control[at.SHORTEST] or h < COLLAPSED_STEP * h_long or _must_change_method(w, data, tolerances):
         return False
@@ -317,7 +317,7 @@ def _can_take_next_step(w, data, tolerances, control, clock, h):
 
 @merged
 def _take_steps(f, w, options, data, tolerances, control, clock, goal, state, n_most, out_t, out_state, out_steps):
-    """Take at most n_most steps, and store their unprojected ends in out_t and out_state; return their number."""
+    """Take at most n_most steps up to the time `goal`; store their ends, before projection; return their number."""
     n, t, n_ends = w.Q.size, clock[at.T], 0
     while n_ends < n_most and t < goal:
         h_wanted = min(clock[at.H_NEXT], control[at.MAX_STEP])

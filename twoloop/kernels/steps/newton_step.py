@@ -46,7 +46,8 @@ from twoloop.kernels.steps.velocity_errors import STEPS_TO_DECAY, filtered_veloc
 
 # the next step computes new derivatives if the last Newton correction exceeds this fraction of the previous one
 SLOW_CONTRACTION = 0.05
-# largest Newton correction, relative to max(1, |value|), that counts as a rounding error in steps of fixed size
+# if corrections no longer decrease in a step of fixed size, Newton's method has converged if the last correction,
+# relative to max(1, |value|), is at most this; otherwise, the step fails
 MAX_ROUNDING_CORRECTION_FIXED = 1e-9
 
 
@@ -126,10 +127,10 @@ def _solve_stages(f, w, options, memory, t, h, tolerances, q, v, A_stage):
 
 @compiled
 def _filter_errors(f, w, options, memory, h, e_q, e_v):
-    """Remove stiff components from errors: replace (e_q, e_v) by (I - z J)^-1 (e_q, e_v), z = h gamma0 (see GAMMA0).
+    """Remove stiff components of error estimates: replace (e_q, e_v) by (I - z J)^-1 (e_q, e_v), z = h gamma0.
 
-    J is the Jacobian of velocities and accelerations by (q_i, v_i). The errors are the first n_dof entries of e_q and
-    e_v (n_q); the other entries are scratch.
+    J is the Jacobian of velocities and accelerations by (q_i, v_i); gamma0: see GAMMA0. The estimates are the first
+    n_dof entries of e_q and e_v (n_q); the other entries are scratch.
     """
     s = int(options[STAGES])
     m = w.independent.size
@@ -184,11 +185,11 @@ def _estimate_error(f, w, options, memory, h, tolerances, state, new_state, A_st
 
 @compiled
 def _error_in_slow_directions(f, w, options, memory, h, tolerances, state, new_state):
-    """Return the effect, in tolerances, of the slowly changing part of the velocity error E_V, see `velocity_error`.
+    """Return the effect, in tolerances, of the slow part of the estimated velocity error E_V, see `velocity_error`.
 
-    `filtered_velocity_error` assumes that all of the error lasts as long as its fastest component. Here, a filter keeps
-    the component that remains after STEPS_TO_DECAY steps, and this component lasts for `motion_time`. If the whole of
-    E_V has an effect of at most 1, return 0. E_Q, E_V and the factors of the filter are overwritten.
+    `filtered_velocity_error` assumes that the whole error lasts as long as its fastest component. Here, a filter keeps
+    the part that remains after STEPS_TO_DECAY steps, and this part is assumed to last for `motion_time`. If even the
+    whole E_V has an effect of at most 1, return 0. E_Q, E_V and the factors of the filter are overwritten.
     """
     s, n = int(options[STAGES]), w.Q.size
     z = STEPS_TO_DECAY * h / options[newton_options_index(s) + at.GAMMA0]

@@ -21,8 +21,7 @@ There are three kinds of storage:
 - dense: J_q and J_v (n_dof, n_dof), from the tangents K and D if the system provides them, otherwise by differences of
   the accelerations;
 - banded, if the system has a bandwidth b: K, D and the border, at a cost proportional to n_q. Without tangents, K and D
-  are computed by differences, in 2 b + 1 groups of columns without common rows (Curtis, Powell and Reid 1974, doi
-  10.1093/imamat/13.1.117). On the beam of 32 elements, sparse factors take 2.5 to 7 times as long;
+  are computed by differences, in 2 b + 1 groups of columns without common rows (doi 10.1093/imamat/13.1.117);
 - sparse, for large systems: all coordinates are treated as independent, and the bordered matrix, with the right-hand
   side [M r; G r], has a fixed sparsity pattern. K and D are computed by differences in groups of columns. Then all
   coordinates are displaced at once; if the residual does not change as K and D predict, the pattern lacks entries that
@@ -74,7 +73,8 @@ from twoloop.kernels.steps.stages import (
 
 MAX_ITERATIONS = 15  # largest number of Newton iterations: if they do not converge, the step fails
 EQUAL_STEP_TOLERANCE = 1e-9  # step sizes count as equal up to this relative difference, which rounding of times causes
-# largest Newton correction, relative to the smallest tolerance, that counts as a rounding error if it does not decrease
+# if corrections no longer decrease, Newton's method has converged if the last one is at most this fraction of the
+# smallest tolerance; otherwise, the step fails
 MAX_ROUNDING_CORRECTION = 0.1
 
 RELATIVE_DISPLACEMENT = 1e-7  # displacement of q or v in finite differences, relative to max(1, |value|)
@@ -113,7 +113,7 @@ def _check_band_finite(A, b):
 
 @compiled
 def _has_jacobian_changed(f, w, t, q):
-    """Store C_q at (t, q) in w.Gx; return whether it differs from the C_q in w.G."""
+    """Store C_q at (t, q) in w.Gx; return True if it differs from the C_q in w.G."""
     w.Gx[:, :] = 0.0
     constraint_rows(f, w, t, q, w.Gx)
     for i in range(w.C.size):
@@ -285,7 +285,7 @@ def _fill_dense_jacobians(f, w, options, memory, s, t, q, v, a):
 
 @compiled
 def _factor_dense_matrix(w, memory, s, index, z, matrix):
-    """Store LU factors of Newton's matrix I - z^2 J_q - z J_v in `matrix`, pivots in `memory`; return a code."""
+    """Store LU factors of I - z^2 J_q - z J_v (Newton's matrix) in `matrix`, pivots at `index`; return a code."""
     n, m = w.Q.size, w.independent.size
     Jq, Jv = as_matrix(matrix_storage(w, n, at.DERIVATIVE_Q), m), as_matrix(matrix_storage(w, n, at.DERIVATIVE_V), m)
     damped = memory[at.HAS_DAMPING] == 1.0
@@ -300,7 +300,7 @@ def _factor_dense_matrix(w, memory, s, index, z, matrix):
 
 @compiled
 def _filter_error_dense(w, options, memory, s, h, e_q, e_v):
-    """Filter e_v (n_dof) as `filter_error` does, by the dense factors from `factor_filter`."""
+    """Filter e_v, an error estimate of v, given e_q, that of q (n_dof), as `filter_error` does; use dense factors."""
     n = w.Q.size
     m = e_q.size
     gamma0 = options[newton_options_index(s) + at.GAMMA0]
@@ -480,7 +480,7 @@ def _solve_and_keep_independents(w, b, numbers, pivots, substitute, x):
 
 @compiled
 def _filter_error_banded(f, w, options, memory, s, h, e_q, e_v):
-    """Filter e_v[:n_dof] as `filter_error` does, by the banded factors; the other entries of e_v (n_q) are scratch."""
+    """Filter e_v[:n_dof], an error estimate of v, given e_q, that of q, as `filter_error` does; use banded factors."""
     n = w.Q.size
     b = f.bandwidth
     z = h * options[newton_options_index(s) + at.GAMMA0]
@@ -506,7 +506,7 @@ N_SPARSE_VECTORS = 3  # number of real scratch vectors, which _sparse_scratch re
 
 
 def matrices_size(program: np.ndarray, n_mass: int, n_jacobian: int, n_systems: int) -> int:
-    """Return the length of w.matrices for sparse storage; the next three functions return views of its parts."""
+    """Return the length of w.matrices in sparse storage; n_mass, n_jacobian: numbers of stored entries of M and G."""
     n = int(program[N_PIVOTS])
     n_tangents = int(program[N_OF_MASS]) - n_mass
     n_factors = n + 2 * int(program[N_OFF_DIAGONAL])
@@ -515,7 +515,7 @@ def matrices_size(program: np.ndarray, n_mass: int, n_jacobian: int, n_systems: 
 
 @inlined
 def _sparse_derivative_views(f, w):
-    """Return views of w.matrices: entries of M, G, K, D; a copy of w.is_independent; factors s of rows added to M."""
+    """Return views of w.matrices: entries of M, G, K, D; copy of w.is_independent; `stiffness` of redundant rows."""
     n_mass, n_jacobian, n_rows = w.mass_values.size, w.jacobian_values.size, w.is_independent.size
     begin_K = n_mass + n_jacobian
     begin_D = begin_K + mass_entries_of(f.newton_program)[0].size - n_mass
@@ -672,7 +672,7 @@ def _fill_sparse_tangents(f, w, memory, t, q, v):
 
 @compiled
 def _factor_sparse_matrix(f, w, z, factors):
-    """Store in `factors` the factors of Newton's matrix [M - z^2 K - z D, G^T; G, 0], for real or complex z."""
+    """Store the factors of [M - z^2 K - z D, G^T; G, 0] (Newton's matrix), z real or complex; return a code."""
     mass, jacobian, K, D, is_independent, stiffness = _sparse_derivative_views(f, w)
     _, _, _, pivot_sizes, _, _ = _sparse_scratch(f, w)
     w.n_factorizations += 1
@@ -682,7 +682,7 @@ def _factor_sparse_matrix(f, w, z, factors):
 
 @compiled
 def _fill_sparse_right_side(f, w, r, right):
-    """Store the right-hand side [M r; G r] of the bordered system in `right`, adjusted for rows added to M."""
+    """Store the right-hand side [M r; G r] of the bordered system in `right`, adjusted for redundant rows."""
     mass, jacobian, _, _, is_independent, stiffness = _sparse_derivative_views(f, w)
     right[:] = 0.0
     rows, columns, _ = mass_entries_of(f.newton_program)
@@ -696,7 +696,7 @@ def _fill_sparse_right_side(f, w, r, right):
 
 @compiled
 def _filter_error_sparse(f, w, options, s, h, e_q, e_v):
-    """Filter e_v (n_q) as `filter_error` does, by the sparse factors from `factor_filter`."""
+    """Filter e_v, an error estimate of v, given e_q, that of q (n_q), as `filter_error` does; use sparse factors."""
     _, _, K, _, _, _ = _sparse_derivative_views(f, w)
     _, _, _, _, right, y = _sparse_scratch(f, w)
     z, n = h * options[newton_options_index(s) + at.GAMMA0], y.size
@@ -724,7 +724,7 @@ def fill_derivatives(f, w, options, memory, s, t, q, v, a):
 
 @compiled
 def _factor_system(f, w, memory, s, index, z, numbers, factorize, substitute):
-    """Store the factors of Newton's matrix, real or complex as z is, in `numbers`; see `_factor_banded`."""
+    """Store factors of Newton's matrix, complex if z is, in `numbers`; arguments and code: see `_factor_banded`."""
     w.n_factorizations += 1
     if f.bandwidth >= 0:
         return _factor_banded(w, memory, s, f.bandwidth, index, z, numbers, factorize, substitute)
@@ -762,7 +762,7 @@ def factor_systems(f, w, options, memory, s, h):
 
 @compiled
 def _solve_system(f, w, memory, s, index, numbers, substitute, X, x):
-    """Replace x[:n_dof] by the solution of Newton's system, by factors from `_factor_system`; X (n_q) is scratch."""
+    """Replace x[:n_dof], a right-hand side, by the solution of Newton's system; `numbers`: factors; X: scratch."""
     m, pivots = w.independent.size, pivots_of(memory, s, w.Q.size, index)
     if f.bandwidth >= 0:
         _multiply_by_T(w, f.bandwidth, x, X)
@@ -812,8 +812,8 @@ def solve_system(f, w, options, memory, s, k, x):
 def filter_error(f, w, options, memory, s, h, e_q, e_v):
     """Remove stiff components from e_v: replace it by (I - z^2 J_q - z J_v)^-1 (e_v + z J_q e_q), with z = h gamma0.
 
-    J_q, J_v: derivatives of accelerations by q_i and v_i; gamma0: a number of the tableau, see GAMMA0. The errors
-    of q and v are the first n_dof entries of e_q and e_v (n_q); the other entries are scratch.
+    J_q, J_v: derivatives of accelerations by q_i and v_i; gamma0: a number of the tableau, see GAMMA0. The
+    estimated errors of q and v are the first n_dof entries of e_q and e_v (n_q); the other entries are scratch.
     """
     m = w.independent.size
     if f.form == FIXED_ORDER:

@@ -161,8 +161,8 @@ def estimate_end_error(tolerances, options, h, state, new_state, A_stage):
     DERIVATIVES_RENEWED,  # 1: diagonal_step.py has computed new derivatives at the end of the step; 0: it has not
     N_MEMORY_SCALARS,
 ) = range(14)
-# indices of the blocks (s, n_q) in `memory`: stage accelerations of the previous step and of the attempted step; of the
-# stages, the residuals of Newton's method, the positions and the velocities
+# indices of the blocks (s, n_q) in `memory`: stage accelerations of the previous step and of the attempted step;
+# residuals of Newton's method, positions and velocities of the stages
 PREVIOUS, TRIAL, RESIDUAL, Q_STAGE, V_STAGE, N_BLOCKS = range(6)
 # indices of the vectors (n_q) after the blocks. For finite differences: accelerations at a displaced state, and the
 # positions and velocities of this state. Then estimated errors of positions and of velocities; and positions,

@@ -76,7 +76,7 @@ KIND, BEGIN, END, MORE_FIRST, _, MORE_SECOND, _, N_GROUP = range(8)
     TRIED,  # 1: the last attempt has computed the series about its end, for the next step if the attempt is accepted
     PASSED,  # if KEEP = 1: time (s) from the state about which the series is computed to the beginning of the step
     TARGET,  # index (0 or 1) of the stored series that `compute_coefficients` overwrites
-    # factor on step sizes with which ends of steps stay near the constraints, see TARGET_PREDICTION_ERROR; 0: unknown
+    # factor (at most 1) on step sizes that keeps the ends of steps near the constraints; 0: unknown
     DISTANCE_FACTOR,
     ATTEMPTS,  # number of attempts; it determines at which times within a step the defect is evaluated
     SUSPECTED,  # 1: SUSPECT is a time that the run has not passed yet; 0: there is no such time
@@ -294,7 +294,7 @@ def array_views(options, memory, n, n_rows):
 
 @merged
 def start_series(options, t, unit, state, N, series, begin_early, x, y, r, c):
-    """Begin a Taylor series: store order 0 of v and early operations, orders 0 and 1 of t and q; set r and c to 0."""
+    """Begin a series in N: store order 0 of v and (from column begin_early) operations, 0 and 1 of t, q; clear r, c."""
     n = r.size
     r[:], c[:] = 0.0, 0.0
     N[0, 0], N[1, 0] = t, unit
@@ -539,7 +539,7 @@ def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
     x = (memory[PASSED] + h) / unit
     error, checks_defect, series_a = 0.0, False, series_accelerations(memory, n)
     if is_estimated:
-        error = x / memory[ALLOWED_SIZE]  # the error of the step is about a power of this ratio: both exceed 1 together
+        error = x / memory[ALLOWED_SIZE]  # the estimated error is about a power of this ratio: both exceed 1 together
         if error > 1.0 + GAP_SLACK:
             return Attempt(DONE, error, 1.0 / error)
         error = min(error, 1.0)

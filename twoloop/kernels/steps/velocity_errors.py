@@ -21,10 +21,10 @@ from twoloop.kernels.steps import stages as at
 from twoloop.kernels.steps.newton_systems import RELATIVE_DISPLACEMENT
 from twoloop.kernels.steps.stages import INNER_TOL, block, vector
 
-# if a velocity error changes as slowly as the motion, it is not due to a vibration. It keeps its sign in later steps:
-# position errors add up. To allow for this, its duration is multiplied by up to this factor
+# if a velocity error changes as slowly as the motion, it is not due to a vibration. It keeps its sign in later steps,
+# so that position errors add up. To allow for this, its duration is multiplied by up to this factor
 SLOW_FACTOR = 10.0
-LONGEST_GAPS = 10.0  # largest assumed duration of a velocity error, relative to the longest time between evaluations
+LONGEST_GAPS = 10.0  # a velocity error is assumed to last at most this * longest time between evaluations
 STEPS_TO_DECAY = 10.0  # number of steps after which fast components of a velocity error count as decayed
 FAST_DURATION = 20.0  # a velocity error may change fast if it lasts less than this times z (step size times gamma)
 OUTDATED_CHANGE = 0.3  # the Jacobian J counts as outdated if its relative change exceeds this
