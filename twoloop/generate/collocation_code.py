@@ -48,14 +48,15 @@ N = 9  # number of nodes
 
 
 class Tables(NamedTuple):
-    """Nodes 0 = c_0 < ... < c_8 = 1 of a step, and linear maps from values at the nodes; row k belongs to node k.
+    """Nodes 0 = c_0 < ... < c_8 = 1 of a step, and matrices for the polynomial p through nine values at the nodes.
 
-    nodes, between : nodes 1 to 8, and the midpoints between neighbouring nodes.
-    velocities, positions : single and double integrals of the polynomial from 0 to each of the nodes 1 to 8.
-    values_between, velocities_between, positions_between : values of the polynomial at the midpoints, and its single
-        and double integrals from 0 to the midpoints.
-    spectrum : coefficients of the Legendre polynomials of degree 1 to 8 on [0, 1], which are 1 at the end.
-    begin, end : coefficients of the polynomial in powers 1 to 8 of the time since the beginning, or since the end.
+    A matrix is used as follows: the sum over k of (value at node k) times (row k) yields the following numbers.
+    nodes, between : these are no matrices, but nodes 1 to 8, and the midpoints between neighbouring nodes.
+    velocities, positions : single and double integrals of p from 0 to each of the nodes 1 to 8.
+    values_between, velocities_between, positions_between : values of p at the midpoints, and its single and double
+        integrals from 0 to the midpoints.
+    spectrum : coefficients of p in the Legendre polynomials of degree 1 to 8 on [0, 1], each scaled to be 1 at 1.
+    begin, end : coefficients of p in powers 1 to 8 of the time since the beginning of the step, or since its end.
     """
 
     nodes: Array
@@ -78,8 +79,8 @@ def tables() -> Tables:
     values = _legendre(x)
     weights = 2 / (N * (N - 1) * values[N - 1] ** 2)
     norms = np.array([np.longdouble(2) / (2 * k + 1) for k in range(N)])
-    norms[N - 1] = np.longdouble(2) / (N - 1)  # squared norm by quadrature, which is not exact for the last polynomial
-    coefficients = values[:N] * weights / norms[:, None]  # row k: coefficients of P_k in the Lagrange polynomials
+    norms[N - 1] = np.longdouble(2) / (N - 1)  # squared norm of P_8 by quadrature at the nodes, not the exact one
+    coefficients = values[:N] * weights / norms[:, None]  # row k: coefficient of P_k in each Lagrange polynomial
     powers = [
         np.array([[sign ** (n + k) * comb(n, k) * comb(n + k, k) for n in range(N)] for k in range(1, N)]).T
         for sign in (-1, 1)
@@ -111,8 +112,8 @@ def _legendre(z: Extended) -> Extended:
 def _integrals(coefficients: Extended, z: Extended) -> tuple[Extended, Extended, Extended]:
     """Return three arrays with a row for each Lagrange polynomial: values at z, single and double integrals up to z.
 
-    `coefficients`: row k contains their coefficients of P_k. `z` is on [-1, 1], but integrals are over the time from 0
-    to (z + 1) / 2, the corresponding point of [0, 1].
+    `coefficients`: row k contains the coefficient of the Legendre polynomial P_k in each Lagrange polynomial. The
+    points z are on [-1, 1]. An integral is over the time, which runs on [0, 1]: from 0 to (z + 1) / 2.
     """
     values = _legendre(z)
     # the integral of P_k from -1 is (P_k+1 - P_k-1) / (2 k + 1), and P_1 + 1 for k = 0; the double integrals follow
@@ -121,28 +122,28 @@ def _integrals(coefficients: Extended, z: Extended) -> tuple[Extended, Extended,
     return coefficients.T @ values[:N], coefficients.T @ single[:N] / 2, coefficients.T @ double / 4
 
 
-MAX_OPERATIONS = 5000  # equations with more operations get no collocation code: this length takes 2 s to compile
+MAX_OPERATIONS = 5000  # equations with more operations get no collocation code; to compile this number takes 2 s
 MIN_DIVISOR = 1e-300  # smaller divisors and allowed errors are replaced by this, so that nothing is divided by zero
 INVALID = -1.0  # result of `find_defect` if the accelerations are invalid (defects are never negative)
 INFINITE = float("inf")
-# if the program with fixed pivots (null_space.py) is not valid in a step, this number of later steps eliminate M first
+# if the fixed pivots of null_space.py fail in a step, this many later steps use the elimination that begins with M
 STEPS_BY_MASS_FIRST = 8.0
 FIRST_DEGREE = 3.0  # degree of the polynomial that predicts the accelerations in the second step
 
 # constants of the iteration. Its contraction, rho, is the ratio of the changes of velocities in two successive sweeps
-KAPPA = 0.02  # sweeps end at this iteration error, in tolerances: total errors are then at most as large as DOP853's
-TARGET_SWEEPS = 6.0  # the step size is chosen for this number of sweeps; more if the prediction has degree 6 or more
-EXTRA_SWEEPS = 7  # if a step has not converged after this number of sweeps beyond the target, it is rejected
+KAPPA = 0.02  # sweeps end if the estimated error of the iteration, relative to the tolerances, is at most this
+TARGET_SWEEPS = 6.0  # step sizes are chosen for this number of sweeps; 1 more if the prediction has degree 6, 2 if more
+EXTRA_SWEEPS = 7  # a step is rejected if it takes this number of sweeps more than the target and has not converged
 MAX_CONTRACTION = 0.8  # if the contraction is at least this in the fourth sweep or later, the step is rejected
 MIN_RHO, MAX_RHO = 1e-3, 0.9  # bounds to which a measured contraction is clipped
-FAST_START, SLOW_START = 0.04, 0.3  # the guess of the first step size is kept if the contraction is between these
-STAGNATION_RATIO = 0.5  # sweeps end if the contraction is at least this, and changes may be rounding (MAX_ROUNDING)
-# values that replace KAPPA, MAX_ROUNDING and the largest number of sweeps in steps of fixed size
+FAST_START, SLOW_START = 0.04, 0.3  # a guessed first step size is kept if the contraction in sweep 2 is between these
+STAGNATION_RATIO = 0.5  # sweeps also end if changes, as small as rounding errors, shrink by no more than this factor
+# in steps of fixed size, these replace KAPPA, MAX_ROUNDING and the largest number of sweeps
 KAPPA_OF_FIXED, ROUNDING_OF_FIXED, MAX_SWEEPS_OF_FIXED = 1e-16, 1e-9, 60.0
-SMALLEST_RATIO = 1e-30  # added to the ratio of the iteration error to KAPPA, because the logarithm of 0 is infinite
+SMALLEST_RATIO = 1e-30  # added to (error of the iteration) / KAPPA before its logarithm is taken: the error may be 0
 ERROR_WEIGHT = 0.5  # factor on the estimated error of a step, see `_estimate_error`
-# allowed defect at midpoints between nodes: in a whole step, it would change velocities by this many tolerances. The
-# limit is above 1, because most of the effect averages out in a step
+# largest allowed product of the step size and the defect of accelerations at a midpoint between nodes, relative to the
+# tolerance of the velocity. It is larger than 1, because most of the effect of the defect averages out in a step
 ALLOWED_DEFECT = 16.0
 
 
@@ -161,8 +162,8 @@ class CollocationCode:
 
     Fields:
     iterated_coordinates : coordinates on whose positions or velocities the accelerations depend.
-    numbers : coefficients that the functions read.
-    structure : key of cached code: digest of everything that the functions depend on, except the values of `numbers`.
+    numbers : Coefficients (program.py) that the functions read from an array.
+    structure : digest of everything that the functions depend on, except values of `numbers`; it identifies them.
     """
 
     def __init__(self, shared: SharedCode):
@@ -185,7 +186,7 @@ class CollocationCode:
 
         if self.split_functions is None:
             programs = [*self.equations.accelerations, self.equations.position_projection, self.equations.projection]
-        else:  # `shared.digest`, part of the digest below, covers the programs that are split into functions
+        else:  # the digest below contains `shared.digest`, which covers the programs of split functions
             programs = self.equations.accelerations[:1]
         numbers = self.numbers
         description = [[each.sizes, *numbers.structure(each)] for each in programs]
@@ -203,11 +204,12 @@ class CollocationCode:
     # methods that write the functions called by lobatto_step.py
 
     def iterate_step(self, emit: LaneEmitter, work: Value, state: Value, tolerances: Value, numbers: Value) -> Value:
-        """Write code that iterates the stages of a step; return its status, such as CONVERGED (data/collocation.py).
+        """Write code that iterates the stages of a step; return the status that this code computes, such as CONVERGED.
 
-        The program with the fewest operations computes the accelerations. Its conditions on pivots are checked once,
-        after the last sweep. If they fail, this step is iterated again with the elimination that begins with M, and
-        STEPS_BY_MASS_FIRST later steps use this elimination from the beginning.
+        In this code, the program with the fewest operations computes the accelerations. Its conditions on pivots are
+        checked once, after the last sweep. If they fail, this step is iterated again with the elimination that begins
+        with M, and STEPS_BY_MASS_FIRST later steps use this elimination from the beginning. Arguments are pointers:
+        `work` to the memory of data/collocation.py, `state` to [q, v, a] before the step, `numbers` to coefficients.
         """
         builder, num = emit.builder, Emitter(emit.builder)
         emit.numbers = emit.constants = numbers
@@ -258,7 +260,7 @@ class CollocationCode:
         return self._iterate(emit, work, state, tolerances, evaluate, fallback)
 
     def _mass_first_function(self, emit: LaneEmitter, kinds: list[str]) -> str:
-        """Return the name of the function that iterates a step and eliminates M first; write it if it is missing."""
+        """Return the name of the function (argument types `kinds`) that iterates a step with M eliminated first."""
         module, name = emit.builder.module, "careful_nodes"
         if not module.defines(name):
             builder = module.function(name, DOUBLE, kinds, internal=True)
@@ -273,7 +275,7 @@ class CollocationCode:
     def _evaluator(
         self, emit: LaneEmitter, work: Value, state: Value, index: int
     ) -> Callable[[list[Value]], Callable[[], Value]]:
-        """Return a function `evaluate` for `_iterate` that writes a call of program `index` of the accelerations."""
+        """Return `evaluate` for `_iterate`: a function that writes a call of `self.equations.accelerations[index]`."""
         accelerations = Emitter(emit.builder).pointer(work, self.a_offset)
 
         def evaluate(inputs: list[Value]) -> Callable[[], Value]:
@@ -285,12 +287,12 @@ class CollocationCode:
         return evaluate
 
     def _accelerations(self, emit: LaneEmitter, work: Value) -> list[Value]:
-        """Load the accelerations of all coordinates at the nodes from `work`: there are too many for the registers."""
+        """Write code that loads the accelerations of all coordinates at the nodes from `work`; return their values."""
         return [load_lanes(emit, work, self.a_offset + LANES * i) for i in range(self.n)]
 
     @contextmanager
     def _returning_if(self, emit: LaneEmitter, condition: Value) -> Iterator[None]:
-        """Return a context: code written in it runs only if `condition` is true, and returns from the function."""
+        """Return a context manager: code written in its block runs if `condition` is true, and must end by a return."""
         builder = emit.builder
         return_block, next_block = builder.append_block(), builder.append_block()
         builder.branch(condition, return_block, next_block)
@@ -299,7 +301,7 @@ class CollocationCode:
         builder.position_at_end(next_block)
 
     def _call(self, emit: LaneEmitter, name: str, write: Callable[..., None], arguments: Sequence[Value]) -> None:
-        """Write a call of the function `name`, which returns nothing; if it is missing, `write` writes its body."""
+        """Write a call of the LLVM function `name`; if the module does not contain it yet, `write` writes its body."""
         module = emit.builder.module
         if not module.defines(name):
             builder = module.function(name, VOID, [each.type for each in arguments], internal=True)
@@ -308,10 +310,11 @@ class CollocationCode:
         emit.builder.call_void(name, arguments)
 
     def _predict_nodes(self, emit: LaneEmitter, work: Value, state: Value, tolerances: Value) -> None:
-        """Store WEIGHTS, STRICTER, SIZE and POWERS in `work`, and predicted positions and velocities at the nodes.
+        """Write code that stores predicted positions and velocities at the nodes, and WEIGHTS, STRICTER, SIZE, POWERS.
 
-        An allowed error is atol + rtol * x: x is |position| (or |velocity|) at the beginning or, if that is larger, its
-        change in half a step. In steps of fixed size, which have no error estimate, rtol = atol = 1.
+        Names in capitals are fields of `work` (data/collocation.py). WEIGHTS depend on allowed errors, atol + rtol * x:
+        x is |position| (or |velocity|) at the beginning or, if that is larger, its change in half a step. In steps of
+        fixed size, which have no error estimate, rtol = atol = 1.
         """
         builder, num, n = emit.builder, Emitter(emit.builder), self.n
         has_fixed_size = builder.compare("fcmp oeq", num.load(tolerances, ESTIMATE), llvm_code.ZERO)
@@ -345,7 +348,7 @@ class CollocationCode:
         used_powers = builder.select(exponents < degree, powers, emit.constant(0.0))
         polynomial = self._polynomial_pointer(emit, work, other=False)
         nodes = np.array(tables().nodes)
-        # single and double integrals of the powers 0 to 8 of the time from 0 to the nodes, a row for each power
+        # row k contains the single (`velocities`) or double (`positions`) integrals of x^k from 0 to the nodes 1 to 8
         velocities = np.array([nodes ** (k + 1) / (k + 1) for k in range(LANES + 1)])
         positions = np.array([nodes ** (k + 2) / ((k + 1) * (k + 2)) for k in range(LANES + 1)])
         with loop_over_coordinates(emit, self.iterated_coordinates) as (k, i, _, _):
@@ -367,7 +370,7 @@ class CollocationCode:
         return factors[0] * factors[1] * (factors[2] * factors[3])
 
     def _vector_emitter(self, emit: LaneEmitter) -> tuple[LaneEmitter, list[int]]:
-        """Return an emitter for vectors of successive coordinates, and the first of each; the last two may overlap."""
+        """Return an emitter for vectors of successive coordinates, and the first of each vector; they may overlap."""
         lanes = min(LANES, 1 << (self.n.bit_length() - 1))
         return LaneEmitter(emit.builder, lanes), [*range(0, self.n - lanes, lanes), self.n - lanes]
 
@@ -380,11 +383,12 @@ class CollocationCode:
         evaluate: Callable[[list[Value]], Callable[[], Value]],
         fallback: Callable[[], Value],
     ) -> Value:
-        """Write sweeps over the stages until they converge, or the step is rejected; return the status of the step.
+        """Write code for sweeps until the stages converge or the step is rejected; return the status it computes.
 
-        `evaluate` writes code that stores the accelerations of the iterated coordinates, given times and positions at
-        the nodes. It returns a function that writes code for the accelerations of the other coordinates, and returns
-        the flag whether all accelerations are valid. If they are not, code that `fallback` writes yields the status.
+        `evaluate` gets the times and positions at the nodes, and writes code that stores the accelerations of the
+        iterated coordinates (those on which accelerations depend). `evaluate` returns a function `store_others`, which
+        writes code that stores the accelerations of the other coordinates, and returns a flag: all are valid. The
+        function `fallback` writes code for the case that they are not valid, and returns the status for this case.
         """
         builder, num = emit.builder, Emitter(emit.builder)
 
@@ -446,10 +450,10 @@ class CollocationCode:
 
     @contextmanager
     def _repeated(self, emit: LaneEmitter, work: Value, state: Value) -> Iterator[list[Value]]:
-        """Return a context: code written in it computes accelerations, and runs twice in each sweep if REPEATS is 1.
+        """Return a context manager; code written in its block computes accelerations from the velocities it yields.
 
-        The context yields the velocities at the nodes: first those of the last sweep, then integrals of the new
-        accelerations.
+        In each sweep, this code runs with the velocities at the nodes from the last sweep. If the field REPEATS of
+        `work` is 1, it then runs again, with the integrals of the new accelerations as velocities.
         """
         builder, num, first_offset = emit.builder, Emitter(emit.builder), integer(self.v_offset)
         before, loop, repeat, after = builder.block, *(builder.append_block() for _ in range(3))
@@ -466,25 +470,25 @@ class CollocationCode:
             v0, a0 = (num.load(num.pointer(state, i), m * self.n) for m in (1, 2))
             of_v = self._weighted_accelerations(emit, tables().velocities, a0, work, i)
             store_lanes(emit, emit.fma(h, of_v, emit.broadcast(v0)), num.pointer(work, k * LANES), self.spectrum_offset)
-        offset.add_incoming(integer(self.spectrum_offset), builder.block)  # memory that is free until `_estimate_error`
+        offset.add_incoming(integer(self.spectrum_offset), builder.block)  # memory not in use before `_estimate_error`
         builder.jump(loop)
         builder.position_at_end(after)
 
     def _load_iterated(self, emit: LaneEmitter, pointer: Value) -> list[Value]:
-        """Load the values of the iterated coordinates at the nodes from `pointer`; return them, and 0 for others."""
+        """Return values at the nodes for each coordinate: loaded from `pointer` if it is iterated, else 0."""
         values = [emit.constant(0.0)] * self.n
         for k, i in enumerate(self.iterated_coordinates):
             values[i] = load_lanes(emit, pointer, LANES * k)
         return values
 
     def _estimate_error(self, emit: LaneEmitter, work: Value, state: Value) -> None:
-        """Store ERROR and CURVATURE, and the ratios FACTOR and FACTOR_OF_ERROR of the next step size to this one.
+        """Write code that stores ERROR, CURVATURE, FACTOR and FACTOR_OF_ERROR (data/collocation.py) after convergence.
 
-        The error estimate extrapolates the decay of the Legendre coefficients of the accelerations. Let t be the
+        The error estimate ERROR extrapolates the decay of the Legendre coefficients of the accelerations. Let t be the
         largest coefficient of degree 7 or 8, s the largest of degree 5 to 8, f the largest of degree 3 to 8. The
         estimate is the larger of t (t / s)^1.5 and t^2 / f. In 99 % of the steps over corners and peaks of forces, the
-        error is at most 20 times the estimate. In smooth motion, it is smaller than the estimate by decades, which
-        costs few steps, because the estimate is of order 12.
+        error is at most 20 times the estimate. In smooth motion, the error is decades smaller than the estimate. This
+        costs few additional steps, because the step size depends only on the 12th root of the estimate.
         """
         builder, num, n = emit.builder, Emitter(emit.builder), self.n
         n_sweeps, change, target, rho = (num.load(work, i) for i in (mem.SWEEPS, mem.CHANGE, mem.N_TARGET, mem.RHO))
@@ -522,9 +526,10 @@ class CollocationCode:
         num.store(builder.extract(factors, 1), work, mem.FACTOR_OF_ERROR)
 
     def find_defect(self, emit: LaneEmitter, work: Value, state: Value, numbers: Value) -> Value:
-        """Return the largest defect between nodes, relative to ALLOWED_DEFECT, or INVALID if accelerations are invalid.
+        """Write code for the largest defect at midpoints between nodes, relative to ALLOWED_DEFECT; return its value.
 
-        Store FACTOR_OF_DEFECT, the largest ratio of the next step size to this one that the defect allows.
+        The value is INVALID if accelerations are invalid. The code also stores FACTOR_OF_DEFECT, the largest ratio of
+        the next step size to this one that the defect allows.
         """
         builder, num, n = emit.builder, Emitter(emit.builder), self.n
         emit.numbers = emit.constants = numbers
@@ -558,7 +563,7 @@ class CollocationCode:
         return builder.select(all_valid, defect, constant(DOUBLE, INVALID))
 
     def store_prediction(self, emit: LaneEmitter, work: Value, state: Value) -> None:
-        """Store the polynomial through the accelerations of a rejected step, to predict those of a shorter step."""
+        """Write code that stores the polynomial of the accelerations in a rejected step; it predicts a shorter step."""
         num, old_polynomial = Emitter(emit.builder), self._polynomial_pointer(emit, work, other=False)
         with loop_over_coordinates(emit, self.iterated_coordinates) as (k, i, _, _):
             a0 = num.load(num.pointer(state, i), 2 * self.n)
@@ -569,9 +574,9 @@ class CollocationCode:
             )
 
     def end_step(self, emit: LaneEmitter, work: Value, state: Value, new_state: Value) -> None:
-        """Store [q, v, a] at the end of the step in `new_state`, and the polynomial that predicts the next step.
+        """Write code that stores [q, v, a] at the step's end in `new_state`, and the polynomial for the next step.
 
-        NEXT_DEGREE becomes the degree that would have predicted the end of this step best, see `_choose_degree`.
+        The polynomial predicts accelerations; the code also stores its degree, NEXT_DEGREE, see `_choose_degree`.
         """
         builder, num, n = emit.builder, Emitter(emit.builder), self.n
         last, h = LANES - 1, num.load(work, mem.H)
@@ -591,7 +596,7 @@ class CollocationCode:
             ):
                 num.store(value, target, begin)
             partial_sums = load_lanes(emit, num.pointer(old_polynomial, k * LANES)) * powers
-            for distance in (1, 2, 4):  # element k becomes the sum of the elements 0 to k
+            for distance in (1, 2, 4):  # after the three passes, element k is the sum of the elements 0 to k
                 shifted = [LANES + k if k < distance else k - distance for k in range(LANES)]
                 partial_sums = partial_sums + builder.shuffle(partial_sums, zero, shifted)
             errors = partial_sums + emit.broadcast(a0 - a1)
@@ -618,10 +623,11 @@ class CollocationCode:
                 num.store(builder.extract(a, last), target, 2 * n)
 
     def _choose_degree(self, emit: LaneEmitter, work: Value, max_error: Value) -> None:
-        """Store NEXT_DEGREE: the lowest degree whose prediction error is at most 1.2 times the smallest error.
+        """Write code that stores NEXT_DEGREE, the lowest degree that predicts nearly as well as the best one.
 
-        It is at least 2, and within 2 of DEGREE; after the first step, it is FIRST_DEGREE. `max_error`: errors at the
-        end of the step of the predictions of degree 1 to 8, one in each lane.
+        Its prediction error is at most 1.2 times the smallest one. It is at least 2, and differs from DEGREE by at most
+        2. If this step was not predicted, it is FIRST_DEGREE. `max_error`: for each lane k, the error that a
+        prediction of degree k + 1 has at the end of this step.
         """
         builder, num = emit.builder, Emitter(emit.builder)
         least = -emit.max_over_lanes(-max_error)
@@ -636,14 +642,14 @@ class CollocationCode:
         num.store(builder.select(predicts, degree, constant(DOUBLE, FIRST_DEGREE)), work, mem.NEXT_DEGREE)
 
     def project_positions(self, emit: LaneEmitter, work: Value, numbers: Value) -> None:
-        """Take a Newton step towards the constraints from the positions at the ends of eight steps; see `_project`."""
+        """Write code for a Newton step towards C = 0 from the positions at the ends of eight steps; see `_project`."""
         if self.split_functions is None:
             self._project(emit, work, numbers, self.equations.position_projection)
         else:
             self._project_in_parts(emit, work, numbers, self.split_functions.project_position, ("moved", "q"))
 
     def project_states(self, emit: LaneEmitter, work: Value, numbers: Value) -> None:
-        """Project the states at the ends of eight steps; store accelerations and multipliers there; see `_project`."""
+        """Write code that projects the ends of eight steps, and stores accelerations, multipliers; see `_project`."""
         if self.split_functions is None:
             self._project(emit, work, numbers, self.equations.projection)
         else:
@@ -652,7 +658,7 @@ class CollocationCode:
     # methods that write parts of functions
 
     def _project(self, emit: LaneEmitter, work: Value, numbers: Value, program: Program) -> None:
-        """Write a projection of the ends of eight steps by a program; store MOVED, and VALID = 0 where it fails."""
+        """Write code that projects the ends of eight steps by `program`; it stores MOVED, and VALID = 0 if invalid."""
         emit.numbers = emit.constants = numbers
         inputs = [load_lanes(emit, work, self.end_offset + LANES * k) for k in range(1 + 2 * self.n)]
         lowering, arrays = lower_program(emit, program, inputs, self.numbers)
@@ -666,7 +672,7 @@ class CollocationCode:
     def _project_in_parts(
         self, emit: LaneEmitter, work: Value, numbers: Value, write: Callable[..., Value], names: tuple[str, ...]
     ) -> None:
-        """Write the code of `_project` by `write`, a method of SplitFunctions that fills the arrays `names`."""
+        """Do the same as `_project` by a method `write` of SplitFunctions; its code stores the arrays `names`."""
         num, moved = Emitter(emit.builder), emit.builder.allocate(DOUBLE, LANES * self.n)
         indices = {name: num.pointer(work, index) for name, index in self._end_offsets().items()} | {"moved": moved}
         state = load_lanes(emit, work, self.end_offset), indices["q"], indices["v"]
@@ -674,7 +680,7 @@ class CollocationCode:
         self._store_largest_move(emit, work, [load_lanes(emit, moved, LANES * k) for k in range(self.n)], is_valid)
 
     def _end_offsets(self) -> dict[str, int]:
-        """Return the offsets in `work` of "q", "v", "a" and "lam" at the ends of eight steps."""
+        """Return the indices in `work` at which the arrays "q", "v", "a" and "lam" of the ends of eight steps begin."""
         return {
             "q": self.end_offset + LANES,
             "v": self.end_offset + LANES * (1 + self.n),
@@ -691,7 +697,7 @@ class CollocationCode:
         store_lanes(emit, emit.builder.select(is_valid, before, emit.constant(0.0)), work, mem.VALID)
 
     def _integrate(self, emit: LaneEmitter, work: Value, state: Value) -> Value:
-        """Integrate accelerations to velocities and positions at the nodes; return the largest change of velocity."""
+        """Write code that integrates accelerations to v and q at the nodes; return the largest change of v * weight."""
         num = Emitter(emit.builder)
         with loop_over_coordinates(emit, self.iterated_coordinates, [emit.constant(0.0)]) as (k, i, (largest,), new):
             before = load_lanes(emit, num.pointer(work, k * LANES), self.v_offset)
@@ -706,7 +712,7 @@ class CollocationCode:
     def _store_stages(
         self, emit: LaneEmitter, work: Value, state: Value, k: Value, i: Value, sums: Sequence[Value]
     ) -> Value:
-        """Store v and q of coordinate i, the k-th iterated one, at the nodes; return v. `sums`: integrals of a."""
+        """Write code that stores v and q of the k-th iterated coordinate, i; return v. `sums`: both integrals of a."""
         num = Emitter(emit.builder)
         h = emit.broadcast(num.load(work, mem.H))
         index, begin = num.pointer(work, k * LANES), num.pointer(state, i)
@@ -718,7 +724,7 @@ class CollocationCode:
         return v
 
     def _node_accelerations(self, emit: LaneEmitter, first: Value, work: Value, i: Value | int) -> list[Value]:
-        """Return the accelerations of coordinate i at all nodes: `first` at the first node, and eight loaded values."""
+        """Return the accelerations of coordinate i at all nodes: `first` at node 0, and eight values from `work`."""
         num = Emitter(emit.builder)
         memory = num.pointer(work, i * LANES)
         return [first, *(num.load(memory, self.a_offset + node) for node in range(LANES))]
@@ -726,7 +732,7 @@ class CollocationCode:
     def _weighted_accelerations(
         self, emit: LaneEmitter, table: Array, first: Value, work: Value, i: Value | int
     ) -> Value:
-        """Apply a map of `Tables` to the accelerations of coordinate i at the nodes, of which `first` is at node 0."""
+        """Apply a matrix of `Tables` to the accelerations of coordinate i at the nodes; `first`: the one at node 0."""
         return self._weighted_sum(emit, table, self._node_accelerations(emit, first, work, i))
 
     def _weighted_sum(self, emit: LaneEmitter, table: Array, terms: Sequence[Value]) -> Value:
@@ -750,7 +756,7 @@ class Collocation(NamedTuple):
 
     functions: DeferredFunctions
     code: CollocationCode
-    numbers: Any  # coefficients that the functions read: values, or expressions in the parameters for several systems
+    numbers: Any  # coefficients that functions read: values or, in cached objects, expressions in the parameters
 
 
 def compiled_collocation(generated: GeneratedCode) -> Collocation:

@@ -36,18 +36,18 @@ from twoloop.kernels.compile.generated_functions import generated_functions
 from twoloop.problem.system import ConstrainedSystem
 
 DOUBLE_POINTER = f"{DOUBLE}*"
-# generated code that adds rows of G to M, or refines solutions, is used only if the relative error of its accelerations
-# near the start (`_loss`) is at most this; during runs, the error grew up to 200 times
+# if generated code adds rows of G to M, or refines solutions (see PivotChoice), the relative error of its accelerations
+# is measured near the start (`_loss`). Above this limit, the code is refused. During runs, errors grew up to 200 times
 LARGEST_LOSS = 1e-8
-MAX_POSITIONS, DISTANCE = 4, 0.02  # number of positions that `_loss` tries at most, and their spacing (m or rad)
+MAX_POSITIONS, DISTANCE = 4, 0.02  # `_loss` tries at most this number of positions, with this spacing (m or rad)
 
 
 def write_accelerations(
     emit: Emitter, equations: Elimination, inputs: Sequence[Value], numbers: Coefficients
 ) -> tuple[list[Value], Value]:
-    """Write code for the accelerations at `inputs`, [t, q, v]; return their values and a flag (whether they are valid).
+    """Write code for the accelerations at `inputs`, [t, q, v]; return the accelerations and a flag: they are valid.
 
-    The code that follows may belong to another LLVM block. `emit` must have the pointers to the coefficients.
+    `numbers` assigns the indices of coefficients in memory; `emit` must have pointers to this memory.
     """
     lowering, n = Lowering(emit, numbers), equations.system.n_q
     for quantity, value in enumerate(inputs):
@@ -65,9 +65,9 @@ def write_accelerations(
 def write_acceleration_function(
     module: Module, name: str, kind: tuple[str, list[str]], equations: Elimination, numbers: Coefficients
 ) -> None:
-    """Write a function that computes accelerations from t, q, v and the coefficients.
+    """Write the LLVM function `name`, which computes accelerations from t, q, v and the coefficients.
 
-    If the accelerations are valid, the function stores them in its last argument and returns true.
+    It stores valid accelerations in its last argument, and returns whether they are valid. `kind`: its LLVM types.
     """
 
     def emit_all(emit: Emitter, t: Value, q: Value, v: Value, coefficients: Value, out: Value) -> Value:
@@ -90,10 +90,10 @@ def _store_if_valid(emit: Emitter, is_valid: Value, pointers: Sequence[Value], a
 def call_accelerations(
     emit: Emitter, equations: Elimination, index: int, inputs: Sequence[Value], numbers: Coefficients, out: Value
 ) -> Value:
-    """Write a call that stores the accelerations at `inputs`, [t, q, v], in `out`; return a flag: they are valid.
+    """Write a call of a function that stores accelerations at `inputs`, [t, q, v], in `out`; return its flag: valid.
 
-    `index`: index of the called program in `equations.accelerations`. 0: program with the fewest operations; -1: the
-    elimination begins with M.
+    `index`: which program of `equations.accelerations` the function runs. 0: program with the fewest operations; -1:
+    elimination that begins with M. `numbers`: Coefficients, which assigns indices to coefficients.
     """
     state = _stack_array(emit, 2 * equations.system.n_q)
     for i, value in enumerate(inputs[1:]):
@@ -105,10 +105,10 @@ def call_accelerations(
 def _accelerations(
     emit: Emitter, equations: Elimination, lowering: Lowering, state: Callable[[], list[Value]]
 ) -> tuple[list[Value], Value]:
-    """Write code for the accelerations; return their values and a flag (whether they are valid).
+    """Write code for the accelerations; return the accelerations and a flag: they are valid.
 
-    If pivots are small, the code calls a function whose elimination begins with M. The arguments of this call are the
-    result of `state()`: t, and pointers to q and v.
+    `lowering`: writer that already has t, q and v. If pivots are small, the written code calls a function whose
+    elimination begins with M; `state()` returns the first arguments of this call: t, and pointers to q and v.
     """
     program, *alternatives = equations.accelerations
     (a,) = program.run(lowering)
@@ -139,7 +139,7 @@ def _accelerations(
 
 
 def _acceleration_function(emit: Emitter, equations: Elimination, index: int, numbers: Coefficients) -> str:
-    """Return the name of the function for program `index` of `equations.accelerations`; write a missing function."""
+    """Return the name of the LLVM function for `equations.accelerations[index]`; if it is missing, write it."""
     program, is_mass_first = equations.accelerations[index], index in (-1, len(equations.accelerations) - 1)
     module, name = emit.builder.module, f"{'mass_first' if is_mass_first else 'quick'}_{emit.suffix}"
     if not module.defines(name):
@@ -163,7 +163,7 @@ def _acceleration_function(emit: Emitter, equations: Elimination, index: int, nu
 
 
 def _coefficient_pointers(emit: Emitter) -> list[Value]:
-    """Return the pointers to the coefficients: one; in SIMD lanes two, to varying and to constant coefficients."""
+    """Return the pointers to coefficients: one; in SIMD lanes two: to varying and to constant coefficients."""
     constants = getattr(emit, "constants", None)
     return [emit.numbers] if constants is None else [emit.numbers, constants]
 
@@ -172,9 +172,9 @@ def _stack_array(emit: Emitter, size: int) -> Value:
     return emit.builder.allocate(DOUBLE, size * width_of(emit.double_type))
 
 
-# numbers of operations above which equations are split into functions. If there is a `reduced_program`, projections are
-# split above SPLIT_PROJECTIONS, which halves the compile time. If not, projections and accelerations are split above
-# SPLIT_ALL, which makes accelerations 50 % slower
+# equations with more operations than this are split into functions. If null_space.py yields a `reduced_program`, the
+# limit is SPLIT_PROJECTIONS, and only projections are split: this halves the compile time. If not, the limit is
+# SPLIT_ALL, and projections and accelerations are split: this makes accelerations 50 % slower
 SPLIT_PROJECTIONS, SPLIT_ALL = 200, 500
 
 
@@ -183,8 +183,8 @@ class SplitFunctions:
 
     solution : programs for the factors of the linear equations M a + G^T lam = r, G a = c, and for the solution;
         `stored_indices` lists the quantities that the parts exchange in memory.
-    position_programs : programs by names of parts, with inputs t, q, v.
-    solution_programs : programs by names of parts, with inputs r, c and the stored factors.
+    position_programs : programs with inputs t, q, v; keys: names of the parts that execute them.
+    solution_programs : programs with inputs r, c and the stored factors; keys: names of the parts that execute them.
     """
 
     def __init__(self, equations: Elimination, numbers: Coefficients):
@@ -208,7 +208,7 @@ class SplitFunctions:
             self._part_writers[name] = partial(self._write_part, program, {})
 
     def structure(self) -> Iterable[Any]:
-        """Yield, for the key of cached code, everything that it depends on except the values of coefficients."""
+        """Yield everything that the functions depend on, except values of coefficients; it identifies them."""
         solution, numbers = self.solution, self.numbers
         yield solution.factor_program.sizes, list(numbers.structure(solution.factor_program))
         for program in self.position_programs.values():
@@ -217,7 +217,7 @@ class SplitFunctions:
             yield program.sizes, list(numbers.structure(program))
 
     def write(self, module: Module, kinds: Callable[[str], tuple[str, list[str]]]) -> list[str]:
-        """Write the functions that kernels call; return their names. `kinds`: LLVM types of a function, by its name."""
+        """Write the functions that kernels call; return their names. `kinds(name)`: LLVM types of a function."""
         functions: dict[str, Callable[..., Any]]
         functions = {"own_correct_positions": self.project_position, "own_project": self.project}
         if self.equations.reduced_program is None:
@@ -229,7 +229,7 @@ class SplitFunctions:
     # methods that write the functions of the parts
 
     def _call(self, emit: Emitter, *calls: tuple[str, Sequence[Value]]) -> Value:
-        """Write calls of parts (pairs: name, arguments), and missing parts; return a flag: all results are valid."""
+        """Write calls of parts, given as (name, arguments), and parts not yet written; return a flag: all are valid."""
         module, all_valid = emit.builder.module, None
         for part, arguments in calls:
             name = f"{part}_{emit.suffix}"
@@ -242,7 +242,7 @@ class SplitFunctions:
         return all_valid
 
     def _lowering(self, emit: Emitter, graph: Graph, args: Sequence[Value], stored: Mapping[int, Location]) -> Lowering:
-        """Return the Lowering that writes a part; `args`: three inputs of `graph`, the coefficients, and others."""
+        """Return a writer for a part of which `args` are the arguments: three inputs, coefficients, then others."""
         *inputs, emit.numbers = args[:4]
         if width_of(emit.double_type) > 1:
             emit.constants = emit.numbers  # type: ignore[attr-defined]  # the coefficients are the same in all lanes
@@ -251,7 +251,7 @@ class SplitFunctions:
         return lowering
 
     def _write_factors(self, emit: Emitter, *arguments: Value) -> Value:
-        """Write the part that stores factors and shared quantities in arguments[4]; return a flag: they are valid."""
+        """Write a part that stores factors and shared quantities in `arguments[4]`; return a flag: all are valid."""
         graph, solution, stored = self.equations.graph, self.solution, arguments[4]
         lowering = self._lowering(emit, graph, arguments, {})
         locations = {i: (stored, index) for i, index in solution.stored_indices.items()}
@@ -262,7 +262,7 @@ class SplitFunctions:
         return lowering.is_valid(solution.factor_program, [])
 
     def _write_part(self, program: Program, stored: Mapping[int, int], emit: Emitter, *arguments: Value) -> Value:
-        """Write the part for a program; return a flag: results are valid. `stored`: quantities loaded from memory."""
+        """Write a part that runs `program`; return a flag: valid. `stored`: memory indices of quantities to load."""
         locations = {i: (arguments[4], index) for i, index in stored.items()}
         lowering = self._lowering(emit, program.graph, arguments, locations)
         results = program.run(lowering)
@@ -271,10 +271,10 @@ class SplitFunctions:
                 emit.store(value, array, j)
         return lowering.is_valid(program, results[0])
 
-    # methods for other classes: they write bodies of functions for kernels, and code of collocation steps in lanes
+    # methods that other classes call, too. `numbers`: pointer to coefficients; other arguments, except t: to vectors
 
     def accelerations(self, emit: Emitter, t: Value, q: Value, v: Value, numbers: Value, a: Value) -> Value:
-        """Write code that stores the accelerations at (t, q, v) in `a`; return whether they are valid."""
+        """Write code that stores the accelerations at (t, q, v) in `a`; return the flag whether they are valid."""
         stored, r, c, lam = self._stack_arrays(emit)
         inputs = [t, q, v, numbers, stored]
         return self._call(
@@ -284,7 +284,10 @@ class SplitFunctions:
     def project_position(
         self, emit: Emitter, t: Value, q: Value, v: Value, numbers: Value, moved: Value, out: Value
     ) -> Value:
-        """Write a Newton step towards C = 0: store q in `out`, its change in `moved`; return a flag: both are valid."""
+        """Write code for a Newton step towards C = 0. It stores the corrected q in `out`, and its change in `moved`.
+
+        Return the flag (a Value) whether both are valid. `numbers`: pointer to the coefficients of the equations.
+        """
         stored, r, c, lam = self._stack_arrays(emit)
         inputs = [t, q, v, numbers, stored]
         _write_zeros(emit, self.n, r)
@@ -311,10 +314,10 @@ class SplitFunctions:
         new_v: Value,
         lam: Value,
     ) -> Value:
-        """Write code that projects q and v onto the constraints in the metric of M; return whether results are valid.
+        """Write code that projects q and v onto the constraints in the metric of M; return a flag: results are valid.
 
         The code stores the change of q in `moved`, the projected q and v in `new_q` and `new_v`, and the accelerations
-        and multipliers at the new v in `a` and `lam`.
+        and multipliers at the new v in `a` and `lam`. `numbers`: pointer to the coefficients of the equations.
         """
         stored, r, c, change = self._stack_arrays(emit)
         projected_v, inputs = _stack_array(emit, self.n), [t, q, v, numbers, stored]
@@ -340,13 +343,13 @@ class SplitFunctions:
         return is_valid
 
     def _stack_arrays(self, emit: Emitter) -> list[Value]:
-        """Return pointers to four arrays on the stack: stored quantities; r; c; velocities or multipliers."""
+        """Return pointers to new arrays on the stack: stored quantities; r; c; a change of v, or multipliers."""
         sizes = self.solution.n_stored, self.n, self.n_rows, max(self.n, self.n_rows)
         return [_stack_array(emit, size) for size in sizes]
 
 
 def _write_return_unless(emit: Emitter, is_valid: Value) -> None:
-    """Write code that returns false from the function if results are invalid; in SIMD lanes, write nothing."""
+    """Write code that returns false from the function if the bit `is_valid` is 0; if it is a vector, write nothing."""
     if is_valid.type == BIT:
         emit.builder.return_false_unless(is_valid)
 
@@ -368,7 +371,7 @@ Array = NDArray[np.float64]
 def write_function(
     module: Module, name: str, kind: tuple[str, list[str]], program: Program, numbers: Coefficients
 ) -> None:
-    """Write a function that computes the arrays of a program from its inputs and its coefficients.
+    """Write the LLVM function `name` (types: `kind`), which computes the arrays of a program from its inputs.
 
     If the program's conditions hold and its first array is finite, the function stores the arrays and returns true;
     else it stores nothing and returns false.
@@ -390,7 +393,7 @@ def write_function(
 class SharedCode:
     """Compiled functions for the equations of one or more systems; cached functions are read from the disk.
 
-    numbers : coefficients that the functions read.
+    numbers : Coefficients (program.py) that the functions read from an array.
     digest : digest of everything that the functions depend on, except the values of coefficients.
     """
 
@@ -398,7 +401,7 @@ class SharedCode:
         self.equations, self.cache, self.numbers, self.split_functions = equations, cache, Coefficients(), None
         if equations.n_operations > (SPLIT_ALL if equations.reduced_program is None else SPLIT_PROJECTIONS):
             self.split_functions = SplitFunctions(equations, self.numbers)
-        # the programs of the functions that are not split into parts, by names of the functions
+        # programs of the functions that are not split into parts; keys: names of the functions
         self.programs = {"own_redundant": equations.redundant_rows}
         if self.split_functions is None:
             self.programs["own_correct_positions"] = equations.position_projection
@@ -409,7 +412,7 @@ class SharedCode:
         self.functions = generated_functions("equations", _stamp(), self.digest, self._module_text, optimise=False)
 
     def specialize(self, system: ConstrainedSystem, evaluate: Evaluator) -> "GeneratedCode":
-        """Return this code with the coefficients of one system; `evaluate` computes them from its parameters."""
+        """Return this code with the coefficients for `system`; `evaluate` computes them from its parameters."""
         return GeneratedCode(
             self, evaluate(self.numbers.formulas), self.equations.traced.specialize(system, evaluate), evaluate
         )
@@ -451,7 +454,7 @@ class GeneratedCode(NamedTuple):
         return self.traced.kinds
 
     def is_valid_from(self, system: ConstrainedSystem, t0: float, q0: Array) -> bool:
-        """Return True if a run may start at (t0, q0) with this code: the pivots chosen there are those of the code."""
+        """Return True if a run may start at (t0, q0) with this code: if the PivotChoice is the same there."""
         try:
             return _choice_at(system, t0, q0) == self.shared.equations.choice
         except Untraceable:
@@ -466,7 +469,7 @@ def _choice_at(system: ConstrainedSystem, t: float, q: Array) -> PivotChoice:
 
 
 def generated_code(system: ConstrainedSystem, t0: float, q0: Array, check: Check = accept_traces) -> GeneratedCode:
-    """Return code for a system and a start, cached or new; `check` raises if calls of callbacks differ from traces.
+    """Return generated code for a start (t0, q0), cached or new; `check` raises Untraceable if traces are wrong.
 
     Raise ValueError if code for the equations cannot be generated.
     """
@@ -487,8 +490,8 @@ def generated_code(system: ConstrainedSystem, t0: float, q0: Array, check: Check
 def _loss(code: GeneratedCode, system: ConstrainedSystem, t0: float, q0: Array) -> float:
     """Return the relative error of accelerations by generated code, at rest, at the start (t0, q0) or near it.
 
-    The first position where pivots are large enough is taken (see MAX_POSITIONS); if there is none, return infinity.
-    Two functions whose pivots may differ compute accelerations, with and without a projection: the larger error counts.
+    At most MAX_POSITIONS positions are tried until pivots are large enough; if they never are, return infinity. Two
+    generated functions compute accelerations, with and without a projection: the larger error of the two is returned.
     """
     rows, n = list(code.shared.equations.choice.rows), system.n_q
     v, a, reduced, lam = np.zeros(n), np.empty(n), np.empty(n), np.empty(system.n_c + system.n_a)
@@ -507,9 +510,9 @@ def _loss(code: GeneratedCode, system: ConstrainedSystem, t0: float, q0: Array) 
         gamma = np.concatenate([system.evaluate(kind, t0, q, new_v) for kind in kinds])
         matrix = np.block([[mass, G[rows].T], [G[rows], np.zeros((len(rows), len(rows)))]])
         right, exact = np.concatenate([force, gamma[rows]]), np.zeros(n + len(rows))
-        for _ in range(3):  # solve, and then refine the solution twice
+        for _ in range(3):  # the first pass solves, the others refine the solution
             exact += np.linalg.solve(matrix, right - matrix @ exact)
-    except ValueError:  # no exact solution: gamma by differences, or undefined forces, or a singular matrix
+    except ValueError:  # nothing to compare with: gamma by differences, undefined forces, or a singular matrix
         return 0.0
     heavy = mass.diagonal() > 0.0
     size = max(np.abs(exact[:n]).max(), np.abs(force[heavy] / mass.diagonal()[heavy]).max(initial=0.0))

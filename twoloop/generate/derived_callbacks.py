@@ -20,14 +20,15 @@ from twoloop.generate.trace import GAMMA_SOURCES, Equations, Evaluator, TraceCac
 from twoloop.generate.traced_values import CallbackTraces, Check, accept_traces
 from twoloop.problem.system import ConstrainedSystem
 
-# callbacks that are derived if the user does not give them; values: attribute of the system with the number of rows
+# keys: callbacks that are derived if the user does not give them; values: attribute of a system, its number of rows
 DERIVABLE_CALLBACKS = {"jacobian": "n_c", "gamma": "n_c", "nonholonomic_gamma": "n_a"}
 
 
 class DerivedPrograms:
     """Programs that replace missing callbacks, shared by all systems that have the same TraceCache (trace.py).
 
-    programs : for each kind of callback, a program and the indices of its results in the callback's flattened array.
+    programs : keys: kinds of callbacks; values: a program, and the indices of its results in the flattened array of the
+        callback.
     traced : the traces that the programs were derived from.
     """
 
@@ -35,7 +36,7 @@ class DerivedPrograms:
         self.programs, self.traced, self.kinds = programs, traced, traced.kinds
 
     def specialize(self, system: ConstrainedSystem, evaluate: Evaluator) -> "DerivedSystem":
-        """Return a system with these programs for its missing callbacks; `evaluate` computes their coefficients."""
+        """Return `system` with these programs as missing callbacks; `evaluate` computes coefficients of programs."""
         functions: dict[str, Any] = {}
         for name, (program, indices) in self.programs.items():
             vectors = program.replace_coefficients(evaluate).as_arrays(indices)
@@ -60,8 +61,8 @@ class DerivedSystem(NamedTuple):
 def derive_callbacks(system: ConstrainedSystem, check: Check) -> tuple[ConstrainedSystem, tuple[CallbackTraces, ...]]:
     """Return a system with programs in place of missing callbacks for C_q and Gamma, and the traces used for them.
 
-    If no callback is missing, or callbacks cannot be traced, return the system itself and an empty tuple; in the second
-    case, finite differences replace missing callbacks. `check` raises Untraceable if the traces are wrong.
+    If no callback is missing, or callbacks cannot be traced, return the system itself and an empty tuple. If callbacks
+    cannot be traced, finite differences replace the missing ones. `check` raises Untraceable if the traces are wrong.
     """
     missing = [kind for kind, size in DERIVABLE_CALLBACKS.items() if getattr(system, size) and kind not in system.given]
     if not missing:
@@ -87,7 +88,7 @@ def _derive_programs(system: ConstrainedSystem, missing: Sequence[str], cache: T
 
 
 def _missing_derivatives(equations: Equations, missing: Sequence[str]) -> dict[str, dict[int, Affine]]:
-    """Return expressions of missing "jacobian" and "gamma" (with non-holonomic rows), by index in the flat array."""
+    """Return expressions of the missing "jacobian" and "gamma" (rows of C, then of A); keys: indices in flat array."""
     system = equations.system
     gamma: dict[int, Affine] = {}
     for kind, first in (("gamma", 0), ("nonholonomic_gamma", system.n_c)):
@@ -101,8 +102,8 @@ def _missing_derivatives(equations: Equations, missing: Sequence[str]) -> dict[s
 
 Array = NDArray[np.float64]
 
-MAX_ENTRIES = 50_000  # callbacks are compared with exact derivatives if [C_q; A] has at most this many entries
-# states at which derivatives are compared: displacements of q in units of its size, and of t in FIRST_TIME_SCALE
+MAX_ENTRIES = 50_000  # callbacks are not compared with exact derivatives if G = [C_q; A] has more entries
+# derivatives are compared at the start, displaced by this fraction of the sizes of q, and of FIRST_TIME_SCALE (s)
 DISPLACEMENTS = (0.0, 1e-3, 0.03)
 
 
@@ -157,7 +158,7 @@ def has_exact_derivatives(system: ConstrainedSystem, t: float, q: Array, v: Arra
 
 
 def generic_states(states: Sequence[tuple[float, Array, Array]]) -> Array:
-    """Return rows [t, q, v] with the t and q of `states`, and random nonzero v of a similar or larger size."""
+    """Return rows [t, q, v] with t and q of `states`, and random nonzero v, at least about as large as given v."""
     times, positions, velocities = (np.array(values, dtype=float) for values in zip(*states, strict=True))
     generic_v = np.array([sizes(q) for q in positions]) * _random_factors(*positions.shape)
     scale = max(1.0, float(np.abs(velocities).max()) / float(np.abs(generic_v).max()))

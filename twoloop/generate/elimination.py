@@ -5,8 +5,9 @@ The matrix of
     [M  G^T] [a  ]   [Q    ]
     [G  0  ] [lam] = [Gamma]
 
-with G = [C_q; A] (A: non-holonomic rows) is eliminated without structural zeros, in an order that is chosen once. Each
-row of G follows its coordinates. So the pivots are pivots of the definite matrices M and -G M^-1 G^T: none is zero.
+with G = [C_q; A] (A: non-holonomic rows) is eliminated in an order that is chosen once; entries that are always zero
+are skipped. A row of G comes after the coordinates in which it has entries. So the pivots are those of the definite
+matrices M and -G M^-1 G^T: none is zero.
 
 - If a row of G has a much smaller pivot than it would have without the other rows, it nearly depends on these rows, and
   the generated code reports that its results are invalid.
@@ -46,7 +47,7 @@ from twoloop.problem.system import ConstrainedSystem
 Array = NDArray[np.float64]
 
 SINGULAR_MASS = 1e-10  # rows of G are added to M if the smallest eigenvalue of M is below this fraction of the largest
-RANK_TOL = 1e-9  # a row of G is dependent if its part orthogonal to other rows is below this fraction of the row
+RANK_TOL = 1e-9  # a row of G is dependent if the norm of its part orthogonal to others is below this fraction
 # a pivot of a row of G is measured relative to the pivot that the row has without the other rows. During a run, the
 # generated code accepts pivots down to about this fraction of the smallest pivot at the start
 PIVOT_FRACTION = 0.01
@@ -63,11 +64,11 @@ N_FEW_COORDINATES = 24
 MIN_INDEX_FEW, MIN_INDEX_FEW_SINGULAR, MIN_INDEX_MANY = 4, 5, 6
 ADDED_SIZE = 16.0  # if s G^T G is added to M, its largest entry is about this many times the largest entry of M
 MAX_PIVOT_RATIO = 1e5  # solutions are refined if a diagonal entry of M with added rows exceeds its pivot by this factor
-SCALE_STEP = 1024.0  # scales of added rows differ by powers of this large number: then most starts have equal scales
+SCALE_STEP = 1024.0  # scales of added rows differ by powers of this large number, so that most starts share their code
 DISPLACEMENT = 0.2  # displacement of coordinates (m or rad) to a position where no entry of M and G is zero by chance
-MIN_GAIN = 2  # rows added to M on trial are kept if the index of min_pivot in MIN_PIVOTS falls by at least this
-# dependent coordinates are eliminated only if there are at least this many constraints per coordinate: otherwise the
-# linear system for the multipliers is smaller
+MIN_GAIN = 2  # rows added to M on trial are kept if they lower the index of min_pivot in MIN_PIVOTS by this or more
+# dependent coordinates are eliminated (null_space.py) only if there are at least this many constraints per coordinate:
+# otherwise the linear system for the multipliers is smaller
 MIN_ROW_RATIO = 2.0 / 3.0
 
 PivotBlocks = tuple[tuple[tuple[int, ...], tuple[int, ...]], ...]
@@ -110,13 +111,11 @@ class PivotChoice:
 
 
 class DependentColumns:
-    """Kernel that chooses dependent coordinates at any position, and the pivot blocks that solve rows of G for them.
+    """Choice of dependent coordinates at a position by a kernel, with the pivot blocks that solve rows of G for them.
 
     rows : indices of the independent rows of G.
-
-    Fields:
-    choose : compiled function of G and `arguments` that returns the number of blocks, see linalg/dependent_columns.py.
-        None: G has too few rows, or the kinds of its entries are unknown.
+    choose (field) : compiled function of G and `arguments` that returns the number of blocks, see
+        linalg/dependent_columns.py. None: G has too few rows, or the kinds of its entries are unknown.
     """
 
     choose: Any = None
@@ -154,7 +153,7 @@ def _entry_kinds(system: ConstrainedSystem) -> Any:
 
     cache = shared_cache(system)
     kinds = cache.remembered("kinds of entries", partial(find_kinds, partial(cache.equations, system)))
-    if kinds is None:  # a callback branches on parameters: it can be traced only for the parameters of one system
+    if kinds is None:  # perhaps a callback branches on parameters: trace it with those of this system
         kinds = system.remembered("kinds of entries", partial(find_kinds, partial(Equations, system)))
     return kinds
 
@@ -211,9 +210,9 @@ class PivotChooser:
         return index if index >= 0 and chosen[2 : 2 + chosen[0]].tolist() == list(choice.rows) else -1
 
     def _try_added_rows(self, choice: PivotChoice, factors: Array, mass: Array, G: Array, index: int) -> PivotChoice:
-        """If adding all independent rows to M makes the smallest pivot much larger, return this choice, else `choice`.
+        """Return `choice` with all independent rows added to M if this makes pivots much larger, else `choice` itself.
 
-        `factors`: factors on the scales s of all rows. `index`: index of `choice.min_pivot` in MIN_PIVOTS. A body may
+        `factors`: factor on the scale s of each row. `index`: index of `choice.min_pivot` in MIN_PIVOTS. A body may
         have little inertia about its joints, such as a rod with a mass in its middle. Then rows are nearly dependent in
         the metric of M, and a smallest pivot of 10^-k costs up to 2 k digits of accelerations. In the metric of
         M + s G^T G, rows are not nearly dependent. If s G^T G is 10^k times as large as M, k digits are lost, and
@@ -229,7 +228,7 @@ class PivotChooser:
         return replace(stiffened, min_pivot=float(MIN_PIVOTS[new_index]))
 
     def _decode(self, index: int) -> PivotChoice:
-        """Return the choice that the compiled search has stored; if `index`, its result, is < 0, raise Untraceable."""
+        """Return the choice that the compiled search stored; `index`: its result; if this is < 0, raise Untraceable."""
         from twoloop.kernels.linalg.rank import STAYS_SINGULAR
 
         system, n_rows = self.system, self.system.n_c + self.system.n_a
@@ -283,7 +282,7 @@ def _hides_little_inertia(choice: PivotChoice, mass: Array, G: Array) -> bool:
     return len(set(choice.scales)) > 1 or ratio > MAX_PIVOT_RATIO
 
 
-MAX_OPERATIONS = 60_000  # largest number of operations of callbacks and elimination: enough for 40 bodies in space
+MAX_OPERATIONS = 60_000  # more operations of callbacks and elimination are refused; 40 bodies in space need fewer
 # `reduced_program` is compiled in addition if it costs at most this fraction of `mass_first_program`, which is needed
 # anyway where pivots are small. At a relative cost of 0.68 (four-bar), it saves 5 % of a run
 MAX_COST_RATIO = 0.75
@@ -349,7 +348,7 @@ class Elimination:
         return Program(self.graph, {"": []}, conditions)
 
     def _matrix(self) -> dict[tuple[int, int], Affine]:
-        """Return the nonzero entries of [M G^T; G 0] with the independent constraint rows G, and rows added to M."""
+        """Return the nonzero entries of [M G^T; G 0], G: independent rows; M with added rows (`choice.added_rows`)."""
         n = self.system.n_q
         matrix = {(i, j): self.mass[i, j] for i in range(n) for j in range(n) if not is_zero(self.mass[i, j])}
         for i, j in matrix:
@@ -371,10 +370,7 @@ class Elimination:
         return matrix
 
     def _solve(self, r: Sequence[Affine], c: Sequence[Affine]) -> tuple[list[Affine], list[tuple[Affine, Affine]]]:
-        """Solve M a + G^T lam = r, G a = c for a and lam (independent rows); see `solve_refined` for the conditions.
-
-        `c`: one entry for each row of G.
-        """
+        """Return [a, lam] with M a + G^T lam = r, G a = c, and conditions, see `solve_refined`; `c`: for all rows."""
         return solve_refined(self.factors.solve, self.choice, self.mass, self.all_rows, r, c)
 
     def _right_sides(self, v: Sequence[Affine]) -> tuple[list[Affine], list[Affine]]:
@@ -419,7 +415,7 @@ class Elimination:
 
     @cached_property
     def right_sides(self) -> Program:
-        """Return the program for "r", the forces Q, and "c", the right-hand sides of G a = c (0 for redundant rows)."""
+        """Return the program for "r", the forces Q, and "c", the right-hand sides of G a = c (0 for unused rows)."""
         force, gamma = self._right_sides(self.v)
         used = {*self.choice.rows, *self.choice.added_rows}
         return Program(self.graph, {"r": force, "c": [x if k in used else self.zero for k, x in enumerate(gamma)]})
@@ -461,7 +457,7 @@ class Elimination:
 
     @cached_property
     def projection(self) -> Program:
-        """Return the program for a projected state "q", "v", the change "moved" of "q", and "a" and "lam" with this v.
+        """Return the program for the projected state "q", "v", the change "moved" of q, and "a", "lam" at projected v.
 
         M, G and Q are evaluated at the position before the projection. "lam" (n_c + n_a,) has the least norm.
         """
@@ -525,9 +521,8 @@ def multipliers_of_least_norm(
 class FactorAndSolvePrograms:
     """Programs that solve M a + G^T lam = r, G a = c in two steps: first the factors, then the solution with them.
 
-    other_programs : programs that run after the first step, at the same state; quantities that they share with it are
-        stored, too.
-
+    other_programs : programs that run after the first step, at the same state. Quantities that they need, and that the
+        first step computes anyway, are stored, too.
     Fields:
     stored_indices : quantities that the first step stores. Keys: indices in the graph of `equations`; values: indices
         in the array of stored quantities, which begins with the factors.
@@ -591,7 +586,7 @@ class FactorAndSolvePrograms:
 
 
 def _shared_quantities(graph: Graph, factors: Sequence[int], other_programs: Sequence[Program]) -> list[int]:
-    """Return the quantities that both `factors` and `other_programs` use, except `factors` themselves."""
+    """Return the quantities that are needed for `factors` and for `other_programs`, except `factors` themselves."""
     computed = set(graph.quantities_for(map(graph.quantity, factors)))
     used = {i for program in other_programs for expr in program.expressions for i in expr.terms}
     for program in other_programs:

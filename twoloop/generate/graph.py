@@ -22,11 +22,11 @@ from twoloop.generate.parameter_expressions import (
 from twoloop.generate.parameter_expressions import Untraceable as Untraceable
 from twoloop.kernels.evaluation import operations as op
 
-# largest number of operations of a derived program or a series: tracing more would take longer than most runs
+# derived programs and series with more operations are refused: to trace them would take longer than most runs
 MAX_TRACED_OPERATIONS = 20_000
-# A product is recorded once for all its multiples: the constant factors of both arguments are taken out. They are not
-# taken out if this might underflow or overflow: if the magnitude of their product is not between MIN_FACTOR and
-# 1 / MIN_FACTOR, or if the product is one of the squares that make up a power with an exponent above HIGH_EXPONENT.
+# a product is recorded once for all its multiples: constant factors are taken out of both arguments. They stay in the
+# arguments if taking them out might underflow or overflow: if the magnitude of their product is not between MIN_FACTOR
+# and 1 / MIN_FACTOR, or for the squares that make up a power with an exponent above HIGH_EXPONENT
 MIN_FACTOR, HIGH_EXPONENT = 1e-100, 8
 # reason in messages about a callback that compares an expression, or converts it to a number
 BRANCHING_REASON = "it branches on, or converts to a number, what depends on t, q or v"
@@ -148,7 +148,7 @@ class Graph(SymbolicObject):
         return [expr for expr in (self.operations[i] or ())[1:] if isinstance(expr, Affine)]
 
     def quantities_by_use(self, exprs: Iterable["Affine"], available: Container[int] = ()) -> list[int]:
-        """Return the indices of `quantities_for` in another order: each one as late as its first use allows."""
+        """Return the indices of `quantities_for` in depth-first order: quantities come close before their first use."""
         order: list[int] = []
         needed: set[int] = set()
         stack = [i for expr in exprs for i in expr.terms][::-1]
@@ -164,7 +164,7 @@ class Graph(SymbolicObject):
         return order
 
     def product(self, a: "Affine", b: "Affine") -> "Affine":
-        """Return the product of a and b as a number times the product of normalized factors, which is recorded once."""
+        """Return a * b: a number times the product of normalized a and b, which is recorded once for all multiples."""
         if not a.terms:
             return b.times(a.constant)
         if not b.terms:
@@ -266,7 +266,7 @@ class Affine:
         for i, c in other.terms.items():
             total = terms[i] + c if i in terms else c
             if _magnitude(total) <= CANCELLATION_LIMIT * _magnitude(c):
-                terms.pop(i, None)  # None: there is no such term if `total` is only c, and c has underflowed to zero
+                terms.pop(i, None)  # default None: if `total` is only c, which has underflowed to zero, no term exists
             else:
                 terms[i] = total
         if _equal(other.constant, 0.0):
@@ -467,7 +467,7 @@ def is_zero(expr: Affine) -> bool:
 
 
 class Derivative:
-    """Directional derivatives of expressions; `direction`: its nonzero components, by indices of inputs."""
+    """Directional derivatives; keys of `direction`: indices of inputs; values: nonzero components of the direction."""
 
     def __init__(self, graph: Graph, direction: dict[int, Affine]):
         self.graph = graph

@@ -2,7 +2,7 @@
 
 `series`, `elimination` and `compile_equations` write the operations. Coefficients are read as vectors, so that each run
 may have its own parameters. The step-size control of Taylor series is generated, too. For the memory `work` and its
-fields, such as T, H, NEW, see kernels/lanes/layout.py. Code is cached on disk; its key is the structure of equations.
+fields, such as T, H, NEW, see kernels/lanes/layout.py. Code is cached on disk for all equations of equal structure.
 """
 
 import hashlib
@@ -51,10 +51,10 @@ from twoloop.problem.system import ConstrainedSystem
 # constants of Taylor steps, as in kernels/steps/taylor_step.py
 # if a step is rejected because PREDICTION_ERROR > 1, the next step size is such that this error becomes TARGET_ERROR
 TARGET_ERROR = 0.3
-MIN_FACTOR, SAFETY, MAX_FACTOR = 0.1, 0.9, 5.0  # of the ratio of successive step sizes: minimum, safety factor, maximum
-MAX_REJECTIONS = 10  # if more successive steps than this are rejected, the run leaves its lane
+MIN_FACTOR, SAFETY, MAX_FACTOR = 0.1, 0.9, 5.0  # ratio of successive step sizes: minimum, safety factor, maximum
+MAX_REJECTIONS = 10  # a run with more successive rejected steps than this is repeated outside the lanes
 FIRST_UNIT = 0.01  # unit of time of the first series of a run, relative to the duration t1 - t0 of the run
-# a projection has converged if a correction is at most ABSOLUTE_CORRECTION (unit of q) or RELATIVE_CORRECTION max|q|
+# a projection has converged if a correction is at most ABSOLUTE_CORRECTION (unit of q) or RELATIVE_CORRECTION * max|q|
 ABSOLUTE_CORRECTION, RELATIVE_CORRECTION = 1e-14, 1e-14
 CONTRACTION = 0.5  # a projection fails if the ratio of a correction to the previous correction is above this
 N_PARALLEL = 3  # number of coordinates whose series one loop evaluates: each needs 3 of the 16 vector registers
@@ -68,15 +68,15 @@ class LaneMemory(NamedTuple):
     state: Value
     new: Value
     predicted: Value
-    series_a: Value  # accelerations as second derivatives of the series
-    a: Value  # accelerations that satisfy the equations of motion
+    series_a: Value  # accelerations by the Taylor series: its second derivative
+    a: Value  # accelerations by the equations of motion
     lam: Value
     series: Value
     scratch: Value
 
 
 class LaneSteps:
-    """Generator of the step-size control for a mechanism of n coordinates and n_rows multipliers."""
+    """Generator of the code of steps for n coordinates and n_rows multipliers; layout.py describes fields such as H."""
 
     n_numbers: int  # number of coefficients that depend on parameters
 
@@ -84,7 +84,7 @@ class LaneSteps:
         self.n, self.n_rows = n, n_rows
 
     def update_unit(self, emit: LaneEmitter, control: Value, work: Value) -> Value:
-        """Store and return UNIT, the unit of time (s) of the series: a new one in new runs and after accepted steps."""
+        """Write code that stores a new UNIT (s), the unit of time of the series, after accepted steps; return UNIT."""
         select, unit = emit.builder.select, emit.load(work, lanes.UNIT)
         is_fresh, is_accepted = (is_set(emit, work, field) for field in (lanes.IS_NEW, lanes.ACCEPTED))
         duration = broadcast_entry(emit, control, lanes.T1) - broadcast_entry(emit, control, lanes.T0)
@@ -100,7 +100,7 @@ class LaneSteps:
         return unit
 
     def choose_sizes(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Store the step size H (s), by the last two terms of the series, and X = H / UNIT; stop runs if H is tiny."""
+        """Write code that stores H, the step size (s) by the last terms of the series, and X = H / UNIT."""
         builder, n, memory = emit.builder, self.n, self.memory(emit, order, control, work)
         unit, (rtol, atol) = emit.load(work, lanes.UNIT), self.tolerances(emit, control)
         one, norms = emit.constant(1.0), []
@@ -139,13 +139,13 @@ class LaneSteps:
             store_mask(emit, work, field, is_continued)
 
     def evaluate_series(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Evaluate the series at X units of time; store NEW, `series_a`, and a copy of the positions as `predicted`."""
+        """Write code that evaluates the series at X units of time, and stores NEW, `series_a`, and q as `predicted`."""
         memory = self.memory(emit, order, control, work)
         for j, q in enumerate(self.evaluate_positions(emit, memory, emit.load(work, lanes.X))):
             emit.store(q, memory.predicted, j)
 
     def evaluate_positions(self, emit: LaneEmitter, memory: LaneMemory, x: Value) -> list[Value]:
-        """Evaluate the series at x units of time; store NEW and the accelerations `series_a`; return the positions."""
+        """Write code that evaluates the series at x units of time, and stores NEW and `series_a`; return positions."""
         positions: list[Value] = []
         n, order = self.n, memory.order
         unit, zero = emit.load(memory.work, lanes.UNIT), emit.constant(0.0)
@@ -171,19 +171,19 @@ class LaneSteps:
         return positions
 
     def evaluate_defect(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Store DEFECT, the defect at the end of a step (see `compute_defect`), from the accelerations in memory."""
+        """Write code that stores DEFECT, the result of `compute_defect` for stored accelerations at the step's end."""
         memory = self.memory(emit, order, control, work)
         a = [emit.load(memory.a, j) for j in range(self.n)]
         emit.store(self.compute_defect(emit, control, memory, a), work, lanes.DEFECT)
 
     def compute_defect(self, emit: LaneEmitter, control: Value, memory: LaneMemory, a: list[Value]) -> Value:
-        """Return the defect of the series at NEW, relative to the tolerances, see control/step_size.py.
+        """Write code for the defect of the series at NEW, relative to its limit; return it. See control/step_size.py.
 
         The defect is the difference between accelerations by the series and `a`, accelerations by the equations.
         """
         n, (rtol, atol) = self.n, self.tolerances(emit, control)
         order, h = emit.to_double(memory.order), emit.load(memory.work, lanes.H)
-        # if h is 0, per_duration is infinite: positions then allow any defect
+        # if h is 0, per_duration is infinite: the tolerances of positions then allow any defect
         duration, per_duration = h / order, order / h
         largest = max_defect = emit.constant(0.0)
         for each in a:
@@ -197,7 +197,7 @@ class LaneSteps:
         return duration * max_defect
 
     def compute_prediction_error(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Store PREDICTION_ERROR: |predicted - projected positions| relative to its limit, see control/step_size.py."""
+        """Write code that stores PREDICTION_ERROR: |predicted - projected q| / limit, see control/step_size.py."""
         n, memory, (rtol, atol) = self.n, self.memory(emit, order, control, work), self.tolerances(emit, control)
         h = emit.load(work, lanes.H)
 
@@ -227,11 +227,11 @@ class LaneSteps:
         emit.store(error, work, lanes.PREDICTION_ERROR)
 
     def crossing_mask(self, emit: LaneEmitter, memory: LaneMemory) -> Value | None:
-        """Return a mask of the lanes whose step may have passed a singular position; None if steps are not checked."""
+        """Write code for a mask of lanes whose step may have passed a singular position; return it; None: no check."""
         return None
 
     def accept_or_reject(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Store ACCEPTED, and LONGEST, the largest next step size; clear RUNNING in lanes whose run has to stop."""
+        """Write code that stores ACCEPTED, LONGEST (largest next step size), and RUNNING = 0 if a run has to stop."""
         builder, one = emit.builder, emit.constant(1.0)
         select, per_order = builder.select, one / emit.to_double(order)
         off, *defects = (emit.load(work, field) for field in (lanes.PREDICTION_ERROR, lanes.WORST_DEFECT, lanes.DEFECT))
@@ -264,7 +264,7 @@ class LaneSteps:
         store_mask(emit, work, lanes.RUNNING, is_running & within_limit)
 
     def commit(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Copy NEW to STATE in the lanes where the step was accepted."""
+        """Write code that copies NEW to STATE in the lanes where the step was accepted."""
         memory = self.memory(emit, order, control, work)
         is_accepted = is_set(emit, work, lanes.ACCEPTED)
         for k in range(2 * self.n):
@@ -304,12 +304,12 @@ def is_set(emit: LaneEmitter, work: Value, field: int) -> Value:
 
 
 def store_mask(emit: LaneEmitter, work: Value, field: int, mask: Value) -> None:
-    """Set a field to 1 in the lanes of a mask, and to 0 in the other lanes."""
+    """Write code that sets a field to 1 in the lanes of a mask, and to 0 in the other lanes."""
     emit.store(emit.builder.select(mask, emit.constant(1.0), emit.constant(0.0)), work, field)
 
 
 def clear_active_unless(emit: LaneEmitter, work: Value, is_valid: Value) -> None:
-    """Clear ACTIVE in the lanes where `is_valid` is false."""
+    """Write code that sets ACTIVE = 0 in the lanes where `is_valid` is false."""
     store_mask(emit, work, lanes.ACTIVE, is_set(emit, work, lanes.ACTIVE) & is_valid)
 
 
@@ -357,14 +357,14 @@ Array = NDArray[np.float64]
 
 WEIGHT_ROUNDING = 1e-13  # weights up to this size count as zero: they are rounding errors of products such as A @ A
 
-# Butcher tableau A, b, c of an explicit Runge-Kutta method (first stage: the state), and weights of two error estimates
+# explicit Runge-Kutta method: arrays A, b, c of its Butcher tableau, then weights of stages in two error estimates
 Tableau = tuple[Array, Array, Array, Array, Array]
 
 
 class LaneStages:
     """Generator of the stages of an explicit Runge-Kutta method, and of its error estimates, for n coordinates.
 
-    Velocities at stages are sums of accelerations weighted by A, positions are sums weighted by A A, so that each
+    Velocities at stages are sums of accelerations weighted by A, positions are sums weighted by A @ A, so that each
     acceleration is loaded once for both. Weights are literals in the code; terms with a weight of zero are left out.
     """
 
@@ -377,7 +377,7 @@ class LaneStages:
         return [np.asarray(each).tobytes() for each in self.tableau]
 
     def write(self, emit: LaneEmitter, arguments: tuple[Value, Value, Value], memory: LaneMemory) -> None:
-        """Store NEW, the state at the time X (s) after the step's beginning, and ERROR, which is valid if X = H."""
+        """Write code that stores NEW, the state X (s) after the step began, and ERROR, which is valid only if X = H."""
         A, b, c, fine_weights, coarse_weights = self.tableau
         _, control, work = arguments
         x, t = emit.load(work, lanes.X), emit.load(work, lanes.T)
@@ -447,7 +447,7 @@ class _Coordinate:
         return 1.0 / (atol + rtol * magnitude)
 
     def store_state(self, weights: Array, position_weights: Array, x: Value) -> tuple[Value, Value]:
-        """Store q and v at a stage in NEW; return both. `weights`: of accelerations in v; `position_weights`: in q."""
+        """Write code that stores q and v at a stage in NEW; return both. Weights: of accelerations in v, and in q."""
         emit, (q, v) = self.emit, self.old_state
         drift = float(weights.sum()) * v
         q = q + x * (drift + x * self.sum(position_weights))
@@ -512,7 +512,7 @@ class LaneCode(LaneSteps):
         return *lanes.TASKS, *lanes.TASKS_OF_STAGES, *explicit_tasks
 
     def series_size(self, order: int) -> int:
-        """Return the number of vectors in `work` for the coefficients of a series up to `order`, and for scratch."""
+        """Return the number of vectors that a series up to `order` needs in `work`: coefficients and scratch memory."""
         assert self.recurrences is not None
         return (order + 1) * self.n + self.recurrences.scratch_size(order)
 
@@ -531,7 +531,7 @@ class LaneCode(LaneSteps):
     # methods that write the generated functions
 
     def compute_series(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Compute the Taylor coefficients of q about the state of each lane, with UNIT as the unit of time."""
+        """Write code that computes the Taylor coefficients of q about STATE in each lane, with UNIT as unit of time."""
         builder, n, memory = emit.builder, self.n, self.memory(emit, order, control, work)
         unit, out, scratch = self.update_unit(emit, control, work), memory.series, memory.scratch
         inputs = [emit.load(work, lanes.T), *(emit.load(memory.state, i) for i in range(2 * n))]
@@ -553,10 +553,10 @@ class LaneCode(LaneSteps):
         store_mask(emit, work, lanes.ACTIVE, is_valid)
 
     def check_defect_within(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Store WORST_DEFECT, the largest defect at equidistant times within the step, at most GAP (s) apart.
+        """Write code that stores WORST_DEFECT, the largest defect at times within the step, at most GAP (s) apart.
 
-        T_NEW becomes each of these times, and finally the end of the step. The times differ from step to step: they are
-        shifted by SHIFT, a multiple of the golden section modulo 1, as far as GAP allows.
+        T_NEW becomes each of these times, and finally the time at the end of the step. The times are equidistant, and
+        lie differently in each step: SHIFT, a multiple of the golden section modulo 1, moves them as far as GAP allows.
         """
         builder, memory = emit.builder, self.memory(emit, order, control, work)
         h, gap = emit.load(work, lanes.H), broadcast_entry(emit, control, lanes.GAP)
@@ -584,7 +584,7 @@ class LaneCode(LaneSteps):
         emit.store(builder.select(is_last, t1, t + h), work, lanes.T_NEW)
 
     def correct_positions(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Correct the positions NEW once in lanes with ACTIVE = 1; set ACTIVE and UNCONVERGED to 1 (success) or 0."""
+        """Write code that corrects q in NEW once where ACTIVE is 1; then ACTIVE = UNCONVERGED = 1 (valid) or 0."""
         is_active, _ = self._project(
             emit, self.equations.position_projection, lanes.ACTIVE, self.memory(emit, order, control, work)
         )
@@ -593,9 +593,9 @@ class LaneCode(LaneSteps):
         emit.store(emit.constant(math.inf), work, lanes.LAST_CORRECTION)
 
     def correct_state(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Project NEW once in lanes with UNCONVERGED = 1; store accelerations and multipliers.
+        """Write code that projects NEW once in lanes with UNCONVERGED = 1, and stores accelerations and multipliers.
 
-        ACTIVE becomes 1 in lanes that have converged, and UNCONVERGED in lanes that need another pass; else 0.
+        Then ACTIVE is 1 in lanes that have converged, else 0; UNCONVERGED is 1 in lanes that need another call, else 0.
         """
         memory = self.memory(emit, order, control, work)
         was_active, is_unfinished = (is_set(emit, work, field) for field in (lanes.ACTIVE, lanes.UNCONVERGED))
@@ -615,7 +615,7 @@ class LaneCode(LaneSteps):
         store_mask(emit, work, lanes.ACTIVE, has_finished | converged)
 
     def _project(self, emit: LaneEmitter, outputs: Program, field: int, memory: LaneMemory) -> tuple[Value, Value]:
-        """Correct NEW by the projection program `outputs`, in the lanes where `field` is 1.
+        """Write code that corrects NEW by the projection program `outputs` in the lanes where `field` is 1.
 
         Return a mask of the lanes whose correction is valid, and the largest change of a position in each lane.
         """
@@ -635,7 +635,7 @@ class LaneCode(LaneSteps):
         return is_active, largest
 
     def compute_accelerations(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Store the accelerations at the state NEW and the time T_NEW; clear ACTIVE in lanes where they are invalid."""
+        """Write code that stores the accelerations at (T_NEW, NEW), and ACTIVE = 0 in lanes where they are invalid."""
         memory = self.memory(emit, order, control, work)
         is_valid, a = self._accelerations(emit, work, memory)
         for k, value in enumerate(a):
@@ -647,14 +647,14 @@ class LaneCode(LaneSteps):
         return is_valid, a
 
     def crossing_mask(self, emit: LaneEmitter, memory: LaneMemory) -> Value | None:
-        """Return `orientation_change_mask` for the step; None for series, whose defects reveal singular positions."""
+        """Return `orientation_change_mask` for the step; None for Taylor steps: defects show singular positions."""
         if self.recurrences is not None or len(self.equations.rows) == 0:
             return None
         ends_of_step = (lanes.T, memory.state), (lanes.T_NEW, memory.new)
         return orientation_change_mask(emit, *(self._row_values(emit, memory, *end) for end in ends_of_step))
 
     def _row_values(self, emit: LaneEmitter, memory: LaneMemory, time: int, base: Value) -> list[dict[int, Value]]:
-        """Return the nonzero entries of each row of G, by column; `time`: field T or T_NEW; `base`: pointer to q, v."""
+        """Write code for the nonzero entries of each row of G, returned by column; `time`: T or T_NEW; `base`: q, v."""
         inputs = [emit.load(memory.work, time), *(emit.load(base, i) for i in range(2 * self.n))]
         _, (entries,) = lower_program(emit, self._row_program, inputs, self.numbers)
         rows: list[dict[int, Value]] = [{} for _ in self.equations.rows]
@@ -663,12 +663,12 @@ class LaneCode(LaneSteps):
         return rows
 
     def compute_stages(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Store NEW and ERROR, computed by the stages of an explicit step."""
+        """Write code that computes the stages of an explicit step, and stores NEW and ERROR."""
         assert self.stage_generator is not None
         self.stage_generator.write(emit, (order, control, work), self.memory(emit, order, control, work))
 
     def check_redundant_rows(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Clear ACTIVE in the lanes where NEW violates a redundant constraint."""
+        """Write code that sets ACTIVE = 0 in the lanes where NEW violates a redundant constraint."""
         memory, outputs = self.memory(emit, order, control, work), self.equations.redundant_rows
         lowering, (no_values,) = lower_program(emit, outputs, self._new_state(emit, work, memory), self.numbers)
         clear_active_unless(emit, work, lowering.is_valid(outputs, no_values))
@@ -706,7 +706,7 @@ class LaneConstraints(LaneSteps):
         self.n_numbers, self.n_quantities = self.numbers.n_varying, len(self._program.quantities())
 
     def compute_rows(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Store C, C_t and the entries of C_q at the state NEW and the time T_NEW in the array `LaneMemory.series`."""
+        """Write code that stores C, C_t and the entries of C_q at (T_NEW, NEW) in the array `LaneMemory.series`."""
         memory = self.memory(emit, order, control, work)
         inputs = [emit.load(work, lanes.T_NEW), *(emit.load(memory.new, i) for i in range(2 * self.n))]
         lowering, arrays = lower_program(emit, self._program, inputs, self.numbers)

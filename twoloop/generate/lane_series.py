@@ -46,7 +46,7 @@ class LaneEmitter(Emitter):
         super().__init__(builder, lanes)
 
     def coefficient(self, number: float) -> Value:
-        """Return `number` in all lanes; a Coefficient that varies with parameters has its own value in each lane."""
+        """Return `number` in all lanes; load a Coefficient: one value for each lane if it varies, else one for all."""
         if not isinstance(number, Coefficient) or number.varies:
             return super().coefficient(number)
         pointer = self.builder.advance(self.constants, integer(number.index))
@@ -142,7 +142,7 @@ def gather_lane(emit: LaneEmitter, vectors: Sequence[Value], lane: int) -> Value
 def loop_over_coordinates(
     emit: LaneEmitter, coordinates: Sequence[int], carried: Sequence[Value] = ()
 ) -> Iterator[tuple[Value, Value, list[Any], list[Any]]]:
-    """Return a context for a loop over k; it yields k, coordinates[k], carried values, and a list for new values."""
+    """Return a context manager that writes a loop over k, like `Emitter.loop`; it also yields coordinates[k]."""
     builder = emit.builder
     table = None if list(coordinates) == list(range(len(coordinates))) else builder.module.add_table(coordinates)
     with emit.loop(integer(0), integer(len(coordinates)), carried) as (k, values, new):
@@ -156,9 +156,9 @@ MAX_SUMS_IN_LOOP = 12 if LANES == 8 else 6
 
 
 class Operation(NamedTuple):
-    """Operation in the program of a Taylor series; sine and cosine of an angle are one operation with two results."""
+    """Operation on Taylor series; the sine and the cosine of an angle are one operation with two results."""
 
-    kind: int
+    kind: int  # such as PRODUCT, see kernels/evaluation/operations.py
     results: tuple[int, ...]  # indices of the quantities that are the results
     first: tuple[Terms, float]  # terms and constant of the first argument
     second: tuple[Terms, float]  # terms and constant of the second argument
@@ -167,10 +167,10 @@ class Operation(NamedTuple):
 class LaneSeries:
     """Generator of the code for the recurrences of a SeriesProgram.
 
-    `scratch` is an array of vectors. Its parts: the factored matrix of the linear equations for accelerations and
-    multipliers; r, the upper part of their right-hand side; the reciprocal divisors in recurrences of roots, logarithms
-    and arctangents; sums computed for the next order (see `_shared_sums`); a row of zeros; and, for each order, a row
-    with the coefficients of all factors of products.
+    `scratch` is an array of vectors. Its parts: the factored matrix of the linear equations M a + G^T lam = r and
+    G a = c for accelerations a and multipliers lam; r; the reciprocal divisors in recurrences of roots, logarithms and
+    arctangents; sums computed for the next order (see `_shared_sums`); a row of zeros; and, for each order, a row with
+    the coefficients of all factors of products.
     """
 
     def __init__(
@@ -209,7 +209,7 @@ class LaneSeries:
         return [self.n, self.n_rows, self.early, self.late, self.rows, self.balance, self.factor_indices]
 
     def _expressions(self, sums: Sums, rows: Sequence[int]) -> list[tuple[Terms, float]]:
-        """Return terms and constant of each expression in `sums`; `rows[k]`: number of expression k in `sums.row`."""
+        """Return (terms, constant) of each expression in `sums`; `rows[k]`: number of expression k in `sums.row`."""
         more: dict[int, list[tuple[int, float]]] = {row: [] for row in rows}
         for row, i, c in zip(
             sums.row.tolist(), sums.further_column.tolist(), sums.further_coefficient.tolist(), strict=True
@@ -222,7 +222,7 @@ class LaneSeries:
         ]
 
     def _row_expressions(self, sums: Sums, indices: Any) -> list[tuple[int, tuple[Terms, float]]]:
-        """Return a pair for each expression in `sums`: its number in `indices`; its terms and constant."""
+        """Return a pair for each expression k in `sums`: its row number, indices[k]; its (terms, constant)."""
         return list(zip(indices.tolist(), self._expressions(sums, indices.tolist()), strict=True))
 
     def _make_operations(self, table: OperationGroups, quantity: int) -> list[Operation]:
@@ -239,17 +239,17 @@ class LaneSeries:
     def _factor_index(self, *key: Any) -> int:
         """Return the index, in each row, of a factor of products of series; a new factor gets the next index.
 
-        `key`: (terms, constant) of the factor, or ("scaled", terms, constant): then k times coefficient k is stored.
+        `key`: (terms, constant) of the factor; or ("scaled", terms, constant): then a row stores order * coefficient.
         """
         return self.factor_indices.setdefault(key, len(self.factor_indices))
 
     def _shared_sums(self) -> dict[int, tuple[int, int]]:
-        """Find products (cos x) x' or (sin x) x'. They need no sum: the recurrence of sin x or cos x computes it.
+        """Find products (cos x) x' and (sin x) x', whose sums need no loop: recurrences of sin x, cos x have the same.
 
         (cos x) x' is the derivative of sin x. So the sum in the recurrence of sin x for order k + 1, divided by the
-        unit of time, is coefficient k of (cos x) x', without the term in coefficient k of x', which is not known yet.
-        The same holds for (sin x) x' and cos x. Keys of the returned dict: the quantities (cos x) x' or (sin x) x';
-        values: the two factors in the recurrence of the sine or cosine, see `_factors`.
+        unit of time, is coefficient k of (cos x) x', except for one term. This term contains coefficient k of x', which
+        is not known yet. The same holds for (sin x) x' and cos x. Keys of the returned dict: indices of the quantities
+        (cos x) x' or (sin x) x'; values: the two factors in the recurrence of the sine or cosine, see `_factors`.
         """
         pairs: dict[Any, tuple[int, int]] = {}
         for operation in self.early:
@@ -263,7 +263,7 @@ class LaneSeries:
         return {result: pair for result, pair in pair_of.items() if pair is not None}
 
     def _factors(self, operation: Operation) -> list[tuple[int, int]]:
-        """Return two factors X, Y (by index) for each result, whose recurrence needs the sum of X[j] Y[k - j]."""
+        """Return, for each result, the indices of the factors X, Y whose sum of X[j] Y[k - j] its recurrence needs."""
         kind, results, first, second = operation
         if results[0] in self._carried_sums:
             return []
@@ -280,7 +280,7 @@ class LaneSeries:
         return [(x, result_indices[1]), (x, result_indices[0])] if kind == SINE else [(x, result_indices[0])]
 
     def write_order_0(self, emit: LaneEmitter, inputs: Sequence[Value], scratch: Value) -> None:
-        """Write code that stores the row of order 0 in `scratch`, next to the factored matrix; `inputs`: t, q, v."""
+        """Write code that stores the row of order 0 in `scratch`, which has the factored matrix; `inputs`: t, q, v."""
         for index in (*range(self.rhs_offset, self.divisor_offset), *range(self.carried_offset, self.row_0_offset)):
             emit.store(emit.constant(0.0), scratch, index)
         row = _Row(self, emit, emit.pointer(scratch, self.row_0_offset))
@@ -291,9 +291,9 @@ class LaneSeries:
             emit.store(quantities.sum(*expr), scratch, self.rhs_offset + index)
 
     def write_order(self, emit: LaneEmitter, k: Value, unit: Value, out: Value, scratch: Value) -> None:
-        """Write code that stores coefficient k + 1 of q in `out`, for k > 0, and the row of order k in `scratch`.
+        """Write code that stores coefficient k + 1 of q in `out`, and the row of order k > 0 in `scratch`.
 
-        `unit`: unit of time of the series. The code first solves for coefficient k - 1 of the accelerations.
+        `unit`: unit of time of the series (s). The code first solves for coefficient k - 1 of the accelerations.
         """
         builder, n = emit.builder, self.n
         next_order = k + 1
@@ -382,11 +382,11 @@ class LaneSeries:
                 row.store((((result, 1.0),), 0.0), value, "if used")
 
     def _write_sums(self, emit: LaneEmitter, scratch: Value, k: Value) -> dict[tuple[tuple[int, int], bool], Value]:
-        """Write loops for the sums of X[j] Y[k - j] over 1 < j < k, or of X[j] Y[k + 1 - j] for the next order.
+        """Write loops for sums over 1 < j < k: of X[j] Y[k - j] for order k, of X[j] Y[k + 1 - j] for order k + 1.
 
-        Keys of the returned dict: pair of indices of the factors X and Y; whether the sum is for order k + 1. The terms
-        j = 1 and j = k need the newest coefficients: `_PartialSums` adds them later, so that the loops do not wait for
-        these coefficients. One loop computes several sums, and loads each row only once.
+        Keys of the returned dict: ((index of factor X, index of factor Y), whether the sum is for order k + 1); values:
+        the sums. The terms j = 1 and j = k need the newest coefficients: `_PartialSums` adds them later, so that the
+        loops do not wait for these coefficients. One loop computes several sums, and loads each row only once.
         """
         keys = [(pair, True) for pair in self.carried_pairs]
         pairs = {pair for each in (*self.early, *self.late) for pair in self._factors(each)}
@@ -423,7 +423,7 @@ class LaneSeries:
     ) -> None:
         """Write code for coefficient k = `order` > 0 of the results of `operations`; `inverse`: 1 / k.
 
-        The term of a PENDING product that contains the unknown coefficient k of its second factor is left out.
+        PENDING products have a second factor whose coefficient k is not known yet: the term with it is left out.
         """
         pairs = list(dict.fromkeys(pair for operation in operations for pair in self._factors(operation)))
         sums = {}
@@ -477,7 +477,7 @@ class _Row:
         self._stored: dict[int, Value] = {}
 
     def store(self, key: Any, value: Value, when: str = "") -> None:
-        """Store a coefficient of the factor `key`; if `when` is "if used", only if products have this factor."""
+        """Store a coefficient of the factor `key`; if `when` is "if used", only if a product has this factor."""
         index = self.code.factor_indices.get(tuple(key)) if when else self.code.factor_indices[tuple(key)]
         if index is not None and index not in self._stored:
             self._stored[index] = value
@@ -491,7 +491,7 @@ class _Row:
 class _PartialSums(NamedTuple):
     """Sums of X[j] Y[k - j] over 1 < j < k, and the rows needed to add the terms j = 1 and j = k, which are missing."""
 
-    sums: dict[tuple[tuple[int, int], bool], Value]  # see `LaneSeries._write_sums`
+    sums: dict[tuple[tuple[int, int], bool], Value]  # keys: ((X, Y), is for order k + 1); X, Y: factor indices
     first_row: Value  # pointer to the row of order 1, or to a row of zeros if k is 1
     row_1: Value  # pointer to the row of order 1
     row_before: _Row  # row of order k - 1

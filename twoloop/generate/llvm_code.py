@@ -38,7 +38,7 @@ from twoloop.kernels.evaluation.operations import (
     SQUARE_ROOT,
 )
 
-MIN_TERMS_SPLIT = 4  # a sum of at least this number of terms is computed as the sum of two halves
+MIN_TERMS_SPLIT = 4  # a sum of at least this many terms is computed as two halves in parallel
 ZERO, ONE = constant(DOUBLE, 0.0), constant(DOUBLE, 1.0)
 # names of LLVM intrinsics by names of functions; a function without an intrinsic is called in libm
 INTRINSICS = {name: f"llvm.{name}" for name in ("sin", "cos", "exp", "log", "sqrt", "rint", "ceil", "fabs")}
@@ -158,10 +158,10 @@ class Emitter:
 
     @contextmanager
     def loop(self, first: Value, end: Value, initial: Sequence[Value]) -> Iterator[tuple[Value, list[Any], list[Any]]]:
-        """Return a context that writes a loop over integers from `first` to `end` - 1.
+        """Return a context manager that writes a loop over integers from `first` to `end` - 1.
 
-        The context yields the integer, the values carried from the previous iteration (`initial` in the first one), and
-        a list, to which the caller appends the new values. After the loop, this list has the final values.
+        It yields the integer, the values carried from the previous iteration (`initial` in the first iteration), and a
+        list, to which the caller appends the new values. After the loop, this list has the final values.
         """
         builder = self.builder
         is_entered = builder.compare("icmp slt", first, end)
@@ -261,7 +261,7 @@ def write(
     builder.ret(emit(emitter(builder), *builder.arguments))
 
 
-LARGEST_ANGLE = 1e6  # largest accepted angle (rad): reduction of larger angles by HALF_PI would be too inaccurate
+LARGEST_ANGLE = 1e6  # results with larger angles (rad) count as invalid: reducing these by HALF_PI is too inaccurate
 HALF_PI = (1.5707963267948966, 6.123233995736766e-17)  # two numbers, whose sum is pi/2 to about twice double precision
 # coefficients of x^3, x^5, ... in sin x, and of x^4, x^6, ... in cos x, on [-pi/4, pi/4], from Moshier's Cephes, sin.c
 SINES = (

@@ -15,7 +15,7 @@ from twoloop.kernels.data.common import OPTIONS
 FAST_MATH_FLAGS = " ".join(sorted(OPTIONS["fastmath"]))  # flags of floating-point instructions, the same as in kernels
 DOUBLE, INTEGER, WORD, BIT, VOID = "double", "i64", "i32", "i1", "void"
 DOUBLES_PER_CACHE_LINE = 8  # size of a cache line of the processor, in doubles
-# number of instructions after which a block is split, if `Module.splits_blocks`: longer blocks double the compile time
+# if `Module.splits_blocks`, a block is split after this number of instructions: longer ones double the compile time
 MAX_BLOCK_LENGTH = 400
 
 
@@ -349,7 +349,7 @@ class Builder:
 
     @contextmanager
     def if_then(self, condition: Value) -> Iterator[None]:
-        """Return a context; the instructions that are appended in it run only if `condition` is true."""
+        """Return a context manager; instructions that are appended in its block run only if `condition` is true."""
         then, after = self.append_block(), self.append_block()
         self.branch(condition, then, after)
         self.position_at_end(then)

@@ -12,7 +12,7 @@ elimination that begins with M computes the accelerations.
 
 Light bodies beside heavy bodies cause pivots of very different size, and elimination loses digits. Then one step of
 refinement restores them: it solves the system again, with the residual of the solution as the right-hand side. If
-refinement changes a solution too much, a condition of the generated code fails, as for small pivots.
+this changes a solution too much, a condition of the generated code fails, as for small pivots.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -43,7 +43,8 @@ class Factors:
     conditions : for each row of G (index `n` and later), a pair of positive expressions: the magnitude of its pivot,
         and the magnitude that this pivot would have if G had no other rows. If the first is less than a small fraction
         of the second, the row nearly depends on other rows, and results are invalid.
-    mass_pivots : pivots of the rows of M (index below `n`). If M is positive definite, all but constants are positive.
+    mass_pivots : pivots of the rows of M (index below `n`), and of rows of G that need no condition. If M is positive
+        definite, all mass_pivots are positive, except perhaps constants.
     """
 
     def __init__(self, matrix: dict[tuple[int, int], Affine], size: int, n: int):
@@ -73,7 +74,7 @@ class Factors:
             self.blocks.append(Block(row_indices, inverse, rows_below))
 
     def _inverse(self, pivots: list[list[Affine]], own_pivots: list[Any]) -> list[list[Affine]]:
-        """Return the inverse of a pivot block; `own_pivots`: pivot of each row of G alone, None for rows of M."""
+        """Return the inverse of a pivot block; `own_pivots`: pivots of rows of G without other rows of G, or None."""
         diagonal = [None if pivot is None else pivot.as_term() for pivot in own_pivots]
         a = pivots[0][0]
         if diagonal[0] is None:
@@ -209,7 +210,7 @@ class DependentCoordinates:
 
     Fields:
     independent : indices of the independent coordinates.
-    T : for each row of the matrix T, its nonzero entries; keys: indices of independent coordinates.
+    T : the matrix T: for each row, its nonzero entries; keys: indices of independent coordinates.
     g : the vector g of length n_q; 0 for independent coordinates.
     conditions : pairs of expressions. If the first is not larger than the second, a pivot is too small.
 
@@ -286,10 +287,10 @@ class DependentCoordinates:
     def _add_conditions(
         self, block: list[list[Affine]], columns: tuple[int, ...], pivot: Affine, solved: list[Terms]
     ) -> None:
-        """Append to `conditions` that a pivot is not small relative to the entries that it divides or to its column.
+        """Append conditions that hold if a pivot is not small relative to entries that it divides, and to its column.
 
         `pivot`: determinant of `block`. In a block of two rows, the second condition is that its columns are not nearly
-        parallel. Squares are compared, because pivots may be negative. `solved`: entries divided by the pivot.
+        parallel. Squares are compared, because pivots may be negative. `solved`: rows after division by the pivot.
         """
         entries = [entry for row in solved for j, entry in row.items() if j < self._n]
         total = _add_products(self._zero, [(entry, entry) for entry in entries])
@@ -342,7 +343,7 @@ def solve_reduced_system(
 
 
 def _pivot_conditions(matrix: dict[tuple[int, int], Affine], factors: Factors) -> Iterator[tuple[Affine, Affine]]:
-    """Yield pairs: pivot of the reduced mass matrix T^T M T (`matrix`); its limit, a fraction of a diagonal entry."""
+    """Yield conditions: a pivot of the reduced mass matrix T^T M T (`matrix`), a fraction of its diagonal entry."""
     pivots = iter(factors.mass_pivots)
     for row_indices, _, _ in factors.blocks:
         first_pivot: Affine | None = None

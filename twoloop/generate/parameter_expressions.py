@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 # product of powers of atoms (see `ParameterTape`) as pairs: index of an atom, exponent; the empty tuple is the number 1
 Powers = tuple[tuple[int, float], ...]
 
-MAX_TERMS = 200  # largest number of terms of a sum of parameters: longer sums take long to compare
+MAX_TERMS = 200  # callbacks with sums of more terms of parameters are refused: these take long to compare
 _as_float = float.__pos__  # converts a Parameter to a float; float(x) raises an exception while callbacks are traced
 # the sum of two terms with opposite signs counts as zero if it is at most this fraction of one of them
 CANCELLATION_LIMIT = 8.0 * 2.0**-52
@@ -71,7 +71,7 @@ class SymbolicObject:
 
     @contextmanager
     def running_callback(self) -> Iterator[None]:
-        """Return a context in which a callback runs; on exit, raise Untraceable if the callback caught a Refusal."""
+        """Return a context manager for a call of a callback; raise Untraceable if the callback caught a Refusal."""
         self.is_tracing, self.refusal_reason = True, ""
         try:
             yield
@@ -188,7 +188,7 @@ class Parameter(float):
         return elementwise(lambda *arguments: apply_function(name, *arguments), inputs, out)
 
     def _refuse_decision(self, reason: str = "it branches on its parameters, or rounds them") -> None:
-        """Refuse an operation by a callback that reveals the current value; modules of `generate` may do it."""
+        """Refuse an operation that reveals the current value, unless a module of `twoloop.generate` does it."""
         caller = sys._getframe(2).f_globals.get("__name__", "")
         if self.tape.is_tracing and not caller.startswith(__name__.rpartition(".")[0]):
             self.tape.refuse(reason)
@@ -291,7 +291,7 @@ def apply_function(name: str, *arguments: Any) -> Any:
 def _record_function(name: str, *numbers: float) -> Parameter:
     tape = _tape_of(*numbers)
     arguments = tuple((x.powers, x.scale) if isinstance(x, Parameter) else ((), x) for x in numbers)
-    with np.errstate(all="ignore"):  # the function may be undefined at the random value
+    with np.errstate(all="ignore"):  # at the random value, the function may be undefined
         value = float(FUNCTIONS[name](*map(float, numbers)))
     return Parameter(value, tape, 1.0, tape.atom((name, arguments)))
 

@@ -24,9 +24,9 @@ from twoloop.kernels.evaluation.operations import KIND, N_COLUMNS, NODE, RESULT
 Array = NDArray[np.float64]
 T = TypeVar("T")
 
-N_COMPARED = 5  # number of states at which a traced function of the user is compared with calls of the function
+N_COMPARED = 5  # a traced function of the user is compared with calls of the function at this number of states
 TIME_SPACING = 0.37  # time (s) between successive compared states; unlikely to be the period of a force
-MAX_TRACE_DIFFERENCE = 1e-10  # relative differences between trace and call up to this size may be rounding errors
+MAX_TRACE_DIFFERENCE = 1e-10  # a trace is wrong if it differs from a call by more (relative): this is no rounding error
 
 # cost of operations by kind, in multiplications; the cost of other operations is not counted
 COSTS = {op.PRODUCT: 1, op.RECIPROCAL: 4}
@@ -165,9 +165,9 @@ class ArrayAlgebra(Algebra[Any]):
 class OperationTable(NamedTuple):
     """Operations of a program as arrays, for the kernels in kernels/evaluation/operations.py.
 
-    Values are numbered; the number of a value is its "node". Inputs come first, then computed quantities. `rows` has a
-    row for each operation: its kind, the node that it computes, and the range of the terms of each argument. `columns`
-    and `coefficients`: node and coefficient of each term. `constants`: the constants of both arguments, by operation.
+    Values are numbered: inputs first, then computed quantities. `rows` has a row for each operation: its kind, the
+    number of the value that it computes, and the range of the terms of each argument. `columns` and `coefficients`:
+    number of the value, and its coefficient, for each term. `constants`: constants of both arguments, by operation.
     """
 
     rows: Any
@@ -202,7 +202,7 @@ class OperationTable(NamedTuple):
         )
 
     def as_floats(self) -> list[float]:
-        """Return the table as floats, to be stored in parameters of a model; results become nodes 0, 1, ..."""
+        """Return the table as floats, to be stored in parameters of a model; results get the numbers 0, 1, ..."""
         rows = self.rows.copy()
         is_result = rows[:, KIND] == RESULT
         n_results = int(is_result.sum())
@@ -226,7 +226,7 @@ class OperationTable(NamedTuple):
 
 Terms = tuple[tuple[int, float], ...]  # pairs of a quantity and its coefficient
 
-LITERALS = (0.0, 1.0, -1.0)  # coefficients that are written into the code, because they need no multiplication
+LITERALS = (0.0, 1.0, -1.0)  # coefficients that are written into generated code: they need no multiplication
 LITERAL_TOLERANCE = 8.0 * 2.0**-52  # largest difference between a coefficient and the literal 1 or -1 that replaces it
 
 
@@ -278,7 +278,7 @@ class Coefficients:
 
     @property
     def formulas(self) -> Any:
-        """Return `values` as floats and Parameters; the array object stays the same until a coefficient is added."""
+        """Return coefficients as floats or Parameters; until one is added, this array object stays the same."""
         if len(self._formulas) != len(self._values):
             self._formulas = number_array(self._values)
         return self._formulas

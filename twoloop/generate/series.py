@@ -25,7 +25,7 @@ from twoloop.problem.system import ConstrainedSystem
 Integers = NDArray[np.int64]
 Array = NDArray[np.float64]
 
-# series are traced only if M, C_q and A have at most this number of entries, or if the user chooses the method Taylor
+# if M, C_q and A have more entries than this, series are traced only if the user chooses the method Taylor
 MAX_ENTRIES = 200_000
 
 # callbacks from which a series is derived
@@ -63,10 +63,10 @@ class OperationGroups:
 class SeriesProgram:
     """Program of a Taylor series; its quantities are t, q, v, a, lam, results of `early` and of `late`, in this order.
 
-    early : operations that depend on t and q only (see the module), and at the end, the products in G v.
-    late : operations that depend on v, too, and at the end, the products in G^T lam + M a.
+    early : operations on quantities that depend on t and q only; after them, the products of entries of G with v.
+    late : operations on quantities that depend on v, too; after them, the products of G^T lam + M a.
     rows, row_indices : G v + (C_t, b) without terms of the form "constant times v_i": nonzero rows, and their indices.
-    balance, balance_indices : Q - G^T lam - M a without terms of the form "constant times lam_i or a_i": likewise.
+    balance, balance_indices : the same for Q - G^T lam - M a without terms "constant times lam_i" or "... a_i".
     traced : traces of the callbacks, to be compared with calls; None: no comparison.
     """
 
@@ -197,9 +197,9 @@ def _sum_of_products(
 ) -> Affine:
     """Return rest + sum_i factors[i] multipliers[i], with few products; new products are added to the dict `products`.
 
-    There are two ways: terms with equal factors share a product, or terms with equal quantities in their factors. The
-    way with fewer new products is taken. In a tie, it is the second if `of_rates` (for a row of G v + (C_t, b)), else
-    the first. The second may yield (cos x) x', which is computed for sin x anyway, see lane_series.py.
+    Way 1: terms with equal factors share a product. Way 2: each factor is split into its quantities, and terms with the
+    same quantity share a product. The way with fewer new products is taken; if both have as many, way 2 if `of_rates`
+    (for a row of G v + (C_t, b)), else way 1. Way 2 may yield (cos x) x', known from sin x, see lane_series.py.
     """
     total = rest
     by_factor: dict[Any, tuple[Affine, Affine]] = {}

@@ -26,12 +26,12 @@ from twoloop.problem.system import ConstrainedSystem
 TIME_CALLBACKS = ("force", "constraint_rate", "nonholonomic_rate")  # callbacks whose dependence on time is analysed
 # callbacks whose dependence on the state is analysed
 STATE_CALLBACKS = ("force", "mass", "constraint", "jacobian", "nonholonomic")
-SMOOTH_OPERATIONS = (PRODUCT, SUM, SINE, COSINE)  # results of these have no short pulses up to the degree MAX_DEGREE
-MAX_DEGREE = 8  # polynomials in time, or in sines and cosines, have no short pulses up to this degree
-MAX_DEGREE_OF_STATE = 32  # polynomials in q and v, and their roots, have no short pulses up to this degree
-MAX_DEGREE_OF_DIVISOR = 4  # a quotient has no short pulses if its divisors have at most this total degree in q, v
-FASTEST_DECAY = -2.0  # a quotient may have short pulses if it decays as x^p with p below this value, like 1 / (1 + x^4)
-MAX_RATE = 4.0  # largest derivative of the argument of a sine, by a coordinate or velocity, for which it is not steep
+SMOOTH_OPERATIONS = (PRODUCT, SUM, SINE, COSINE)  # polynomials of these have no short pulses up to MAX_DEGREE
+MAX_DEGREE = 8  # polynomials in time, or in sines and cosines, of a higher degree may have short pulses
+MAX_DEGREE_OF_STATE = 32  # polynomials in q and v of a higher degree, and their roots, may have short pulses
+MAX_DEGREE_OF_DIVISOR = 4  # a quotient may have short pulses if its divisors have a higher total degree in q, v
+FASTEST_DECAY = -2.0  # a quantity may have short pulses if it decays as x^p with p below this value, like 1 / (1 + x^4)
+MAX_RATE = 4.0  # a sine is steep if the derivative of its argument by a coordinate or velocity is larger than this
 # systems with more coordinates are not traced for this analysis: that may take ten times as long as sampling the forces
 MAX_COORDINATES = 300
 TIME_MASK = 1  # bit mask of t, the first input of a graph
@@ -111,7 +111,7 @@ def _make_analysis(system: ConstrainedSystem) -> Any:
 
 
 class DegreeAlgebra(Algebra[float]):
-    """Algebra of degrees: a value is a quantity's degree as a polynomial in `inputs`; f(x) has the degree of x."""
+    """Algebra of degrees: the value of a quantity is its degree as a polynomial in `inputs`; f(x) counts like x."""
 
     functions: Mapping[int, Callable[[float], float]] = MappingProxyType(
         {

@@ -158,7 +158,7 @@ def _refuse_symbols(value: Any, verb: str) -> None:
 
 
 def _numeric_function(function_of_numbers: Any, name: str) -> Callable[..., Any]:
-    """Return a function that refuses symbols (`function_of_numbers` might not treat them like numbers)."""
+    """Return `function_of_numbers` (`name` in messages) with a check that refuses symbols as its arguments."""
 
     @functools.wraps(function_of_numbers)
     def call_with_numbers(*arguments: Any, **options: Any) -> Any:
@@ -273,9 +273,7 @@ class Equations:
     """Traced callbacks of a system; each callback is traced once, when its trace is first used.
 
     parameters : numbers or Parameters that callbacks get as parameters; None: the parameters of the system.
-
-    Fields:
-    graph : graph of the traces; its first inputs are t, q and v.
+    graph (field) : graph of the traces; its first inputs are t, q and v.
     """
 
     def __init__(self, system: ConstrainedSystem, parameters: Any = None):
@@ -309,10 +307,9 @@ class Equations:
         return equations
 
     def expressions(self, kind: str, v: Sequence[Affine] | None = None) -> Any:
-        """Return the result of a callback as expressions; if it is missing, derivatives (C_q, gamma), or else zeros.
+        """Return the result of a callback as expressions; `v`: expressions that replace the inputs `self.v`.
 
-        `v`: expressions that replace the inputs `self.v` as velocities.
-
+        If there is no callback, the result is derived from other callbacks (C_q, gamma), or consists of zeros (others).
         Raise Untraceable if a callback does not run on symbols; the message names the callback and the reason.
         """
         if v is not None and "v" in KINDS[kind].state:
@@ -430,7 +427,6 @@ class TraceCache:
     parameters : parameters of one of the systems.
     classes : class of each parameter: 0 if the parameter is a constant in the traces. Otherwise a number 1, 2, ...,
         which is the same for parameters of equal magnitude, with the sign of the parameter.
-
     Fields:
     parameters : parameters with which callbacks are traced: Parameters with random values, and constants.
     traced_kinds : kinds of callbacks that were traced. They do not branch, and so always write to the same entries.
@@ -471,7 +467,7 @@ class TraceCache:
         return self._tape.product_evaluator(self.magnitudes(parameters))
 
     def evaluator(self, parameters: Array) -> Evaluator:
-        """Return a function that evaluates arrays of expressions for `parameters` (n_p,); arrays must not change."""
+        """Return a function that evaluates arrays of expressions for `parameters`; arrays must not change later."""
         product = self.product_evaluator(parameters)
 
         def evaluate(array: Any) -> Array:
@@ -513,11 +509,10 @@ def derive_cached(
 ) -> Any:
     """Return what `make` derives from traces (for example a series), with the parameters of one system inserted.
 
-    `make` gets a TraceCache, and returns an object with a method `specialize`. Results are cached by `key`.
-
-    The first TraceCache is shared with other systems. If callbacks cannot be traced with variable parameters, or if
+    `make` gets a TraceCache, and returns an object with a method `specialize`. Results are cached by `key`. First, the
+    TraceCache that is shared with other systems is used. If callbacks cannot be traced with variable parameters, or if
     `check` raises Untraceable for the result (a callback may treat variable parameters differently from numbers), a
-    cache for this system alone is used instead. If this fails in the same way, Untraceable is raised.
+    cache for this system alone is used. If this fails in the same way, Untraceable is raised.
     """
     for find_cache in (_own_cache,) if system.called_in_python else (trace_cache_of, _own_cache):
         cache = system.remembered(("trace cache", find_cache), partial(find_cache, system))
@@ -534,7 +529,7 @@ def derive_cached(
 
 
 def _derive_shared(system: ConstrainedSystem, cache: TraceCache, key: Any, make: Callable[[TraceCache], Any]) -> Any:
-    """Return what `make` derives from `cache`, specialized for `system`; if this fails, return an Untraceable."""
+    """Return what `make` derives from `cache`, specialized for `system`; if this fails, return the Untraceable."""
     try:
         result = cache.remembered(key, partial(make, cache))
         return result.specialize(
@@ -547,13 +542,13 @@ def _derive_shared(system: ConstrainedSystem, cache: TraceCache, key: Any, make:
 
 
 def load_checked_bounds(system: ConstrainedSystem) -> None:
-    """Add to `system.within_bounds` the kinds of callbacks whose indices were checked in systems with equal traces."""
+    """Mark callbacks as checked for indices out of bounds if they were checked in another system with equal traces."""
     if not system.called_in_python:
         system.within_bounds |= shared_cache(system).within_bounds
 
 
 def share_checked_bounds(system: ConstrainedSystem) -> None:
-    """Add the traced kinds in `system.within_bounds` to the trace cache, so that other systems skip their check."""
+    """Note in the trace cache which traced callbacks were checked for indices out of bounds: others skip the check."""
     if not system.called_in_python:
         cache = shared_cache(system)
         cache.within_bounds |= cache.traced_kinds & system.within_bounds
@@ -599,7 +594,7 @@ class ParameterArrays:
     def __init__(self) -> None:
         # keys: id(array of expressions); values: this array, which must exist as long as its id is used; its numbers
         self._arrays: dict[int, tuple[Any, Array]] = {}
-        # flat array of numbers; indices of its entries that vary; range of their values among all values in `write`
+        # tuples: flat array of numbers; indices of its entries that vary; range of these entries in `values` of `write`
         self._number_arrays: list[tuple[Array, NDArray[np.int64], slice]] = []
         self._products: dict[Powers, int] = {}
         self._scales: list[float] = []
@@ -607,10 +602,7 @@ class ParameterArrays:
         self._gathered_products: tuple[list[Powers], Array, NDArray[np.int64]] | None = None
 
     def array(self, exprs: Any) -> Array:
-        """Return the array of numbers that replaces `exprs`; later calls for the same object return the same array.
-
-        If the entries of `exprs` are plain numbers, return `exprs`.
-        """
+        """Return the array of numbers for `exprs`, the same in later calls; `exprs` itself if it has numbers only."""
         if exprs.dtype != object:
             return exprs  # type: ignore[no-any-return]
         if id(exprs) not in self._arrays:

@@ -41,17 +41,17 @@ MAX_ENTRIES = 20_000  # approximate largest number of compared entries in a run:
 # Between them, `_is_systematic` decides
 ROUNDING_DIFFERENCE = 16.0 * np.finfo(float).eps
 CLEAR_DIFFERENCE = 1e-6
-# `_is_systematic` compares at N_NEIGHBOURS states, at relative distances up to PERTURBATION from a given state
+# `_is_systematic` compares call and trace at N_NEIGHBOURS states; PERTURBATION: their largest relative distance
 PERTURBATION, N_NEIGHBOURS = 1e-7, 12
-MARGIN = 0.01  # a CheckedRegion exceeds the checked states by this fraction of their range; most steps are longer
-MARGIN_AT_REST = 1e-9  # fraction of the largest range that is added to this, for coordinates at rest, whose range is 0
+MARGIN = 0.01  # a CheckedRegion is larger than the range of checked states by this fraction, shorter than most steps
+MARGIN_AT_REST = 1e-9  # this fraction of the largest range is added, for coordinates at rest, whose own range is 0
 
 
 class CallbackTraces:
     """Traces of callbacks as an operation table, to be compared with calls of the callbacks.
 
     graph : the graph of the trace, whose first inputs are t, q and v.
-    exprs : arrays of expressions by kind of callback; None: those in `graph.traced`, for callbacks that the system has.
+    exprs : keys: kinds of callbacks; values: arrays of expressions. None: `graph.traced`, for callbacks of the system.
     """
 
     def __init__(self, system: ConstrainedSystem, graph: Graph, exprs: Mapping[str, Any] | None = None):
@@ -78,7 +78,7 @@ class CallbackTraces:
         return traced
 
     def replace_coefficients(self, convert: Callable[[Any], Array]) -> "CallbackTraces":
-        """Return a copy in which convert(array) replaces each array of coefficients; its traces are not trusted yet."""
+        """Return a copy in which convert(array) replaces each array of coefficients; its `is_trusted` is False."""
         traced = copy.copy(self)
         traced.program = self.program.replace_coefficients(convert)
         traced.is_trusted = False
