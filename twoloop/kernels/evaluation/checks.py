@@ -54,7 +54,7 @@ def _fit_column_units(rows, columns, mask, logs):
 
 @exact
 def _fit_row_units(columns, rows, mask, logs):
-    """Fit the units of rows to given units of coordinates; arguments as in `_fit_column_units`."""
+    """Fit the logarithms of row units, `rows`, to those of coordinate units, `columns`; see `_fit_column_units`."""
     for i in range(rows.size):
         total, n = 0.0, 0
         for j in range(columns.size):
@@ -126,10 +126,10 @@ def linear_ranges(coordinates_in_units, radius, negligible, scratch, ranges):
 
 
 # flags that `evaluate_start` returns. WELL_FORMED: all values are finite, M is symmetric, no row of C_q or A is zero.
-# CONSISTENT: the state satisfies the constraints up to rounding. Only if M is not constant: DEFINITE if all eigenvalues
-# of M exceed a limit, `roundings[2]` * max|M_ij|, times EIGENVALUE_MARGIN; INDEFINITE if one is below limit / this
+# CONSISTENT: the state satisfies the constraints up to rounding. Only for a varying M, with L = roundings[2] max|M_ij|:
+# DEFINITE if all eigenvalues of M exceed L * EIGENVALUE_MARGIN; INDEFINITE if one is below L / EIGENVALUE_MARGIN
 WELL_FORMED, CONSISTENT, DEFINITE, INDEFINITE = 1, 2, 4, 8
-MAX_RELATIVE_DISTANCE = 0.5  # recorded sizes are used at q if each q_j moved by at most this part of its recorded size
+MAX_RELATIVE_DISTANCE = 0.5  # recorded sizes apply to q if each |q_j - recorded q_j| is at most this part of the size
 ROUNDING_OF_ZERO = 2.0**-52  # a coordinate up to this fraction of the largest one may be zero with a rounding error
 EIGENVALUE_MARGIN = 2.0  # if the least eigenvalue of M is within this factor of its limit, a check in Python decides
 
@@ -445,7 +445,7 @@ def _run_trace(program, columns, coefficients, constants, nodes, values, bounds)
 
 @exact
 def _count_differences(called, traced, bounds):
-    """Return how many entries of `called` are not finite, or differ from `traced`, as `compare_traces` defines it."""
+    """Return how many entries of `called` are not finite, or differ from `traced` by more than rounding allows."""
     count = 0
     for i in range(called.shape[1]):
         largest = 0.0

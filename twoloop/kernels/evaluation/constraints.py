@@ -73,7 +73,7 @@ def kinematics(f, w, t, q, v):
 
 @merged
 def gather_independent_columns(G, rate, rows, independent, D):
-    """Store in row j of D the column -G[rows, independent[j]], and in its last row -rate[rows]: right-hand sides."""
+    """Store in row j of D the column -G[rows, independent[j]], in its last row -rate[rows]: as right-hand sides."""
     for j in range(independent.size):
         column = independent[j]
         for k in range(rows.size):

@@ -83,7 +83,7 @@ def mass_matrix(f, w, t, q):
 
 @merged
 def factor_mass_at(f, w, t, q):
-    """Store M(t, q) in w.M and, if the equations use them, its factors in w.L; return DONE or a failure code."""
+    """Store M(t, q) in w.M and, if the form f.form uses them, its factors in w.L; return DONE or a failure code."""
     w.factored = 0.0
     mass_matrix(f, w, t, q)
     code = factor_mass(f, w) if f.form == MULTIPLIERS or has_banded_mass(f) else DONE
@@ -309,7 +309,7 @@ def inner_loop(f, w, task, t, q, v, tolerance, a, lam):
 def evaluate(f, w, t, q, v, tolerance, a):
     """Compute dependent from independent entries of q and v, and the accelerations `a`; return DONE or a failure code.
 
-    `tolerance`: of corrections of q. The Jacobian that was factored last is used, at q or at most w.reuse from it.
+    The last correction of q is at most `tolerance`. The Jacobian factored last is used: at q, or up to w.reuse from it.
     """
     return f.inner(f, w, tasks.EVALUATE, t, q, v, tolerance, a, w.lam)
 
@@ -331,7 +331,7 @@ def evaluate_without_projection(f, w, t, q, v, a):
 
 @merged
 def project(f, w, t, q, v, theta, a, lam):
-    """Project (q, v) onto the constraints, in place; `theta`: of corrections, see `project_state`; return a code."""
+    """Project (q, v) onto the constraints, in place; `theta`: limit of the last correction of q; return a code."""
     code = f.inner(f, w, tasks.PROJECT, t, q, v, theta, a, lam)
     if code == DONE and has_new_entries(w.G, w.pattern):
         code = f.inner(f, w, tasks.VERIFY_PATTERN, t, q, v, theta, a, lam)
@@ -364,7 +364,7 @@ def find_tangents(f, w, t, q):
 
 @merged
 def prepare_mass(f, w, t, q):
-    """Store M(t, q) in w and, if the equations use them, its factors; return DONE or a failure code."""
+    """Store M(t, q) in w and, if the form f.form uses them, its factors; return DONE or a failure code."""
     return f.inner(f, w, tasks.PREPARE_MASS, t, q, q, 0.0, w.x, w.lam)
 
 

@@ -86,7 +86,7 @@ def _run_program(program, numbers, nodes, t, q, v):
 
 @exact
 def _result_indices(program):
-    """Return the number of results, their first index in `nodes`, and the first index in `program` of their targets."""
+    """Return the number of results, their first index in `nodes`, and where `program` lists their output indices."""
     n = program[N_RESULTS]
     return n, program[N_NODES] - n, N_SIZES + N_COLUMNS * program[N_ROWS] + program[N_TERMS]
 

@@ -223,7 +223,7 @@ def write_programs(w):
 
 @compiled
 def _record_columns_of_entries(w):
-    """Store in w.row_entries lists of the columns where w.pattern is 1, one for each row, after the lists' begins."""
+    """Store in w.row_entries where the list of each row begins, then these lists: the columns where w.pattern is 1."""
     n_rows = w.Rate.size
     index = n_rows + 1
     for i in range(n_rows):
@@ -323,7 +323,7 @@ def choose_oriented_partition(f, w, t, q):
 
 @compiled
 def _largest_coefficient(w):
-    """Return the largest |coefficient| with which an independent row enters a redundant row, in rows of maximum 1."""
+    """Return the largest |coefficient| if redundant rows are combinations of independent ones (row maxima: 1)."""
     rows = rows_of(w.index_v)
     largest = 0.0
     begin = 0
@@ -414,7 +414,7 @@ def evaluate_and_factor_columns(f, w, t, q):
 
 @compiled
 def is_rounding_of_positions(w, q, correction):
-    """Return True if `correction`, the largest change of a position, may be a rounding error (limits: see above)."""
+    """Return True if `correction`, the largest change of a position, may be due to rounding (see AMPLIFICATION)."""
     limit = ROUNDING_OF_CORRECTIONS * largest_of(q)
     return correction <= limit or (correction <= AMPLIFICATION * limit and _is_on_constraints(w, q))
 

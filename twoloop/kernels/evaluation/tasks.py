@@ -14,5 +14,5 @@
     ADOPT_MIDPOINT,
     VERIFY_PATTERN,
     CHECK_REDUNDANT,
-    SOLVE,  # only the inner loop for large systems has this task, see sparse_inner_loop.py
+    SOLVE,  # solve M a + G^T lam = r, G a = c; only the inner loop for large systems has this task
 ) = range(14)
