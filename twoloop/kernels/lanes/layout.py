@@ -192,7 +192,10 @@ def _raised_value(work, target, error, factor, before, after, atol, rtol):
 
 @compiled
 def raise_to_ratio(work, target, error, factor, before, after, atol, rtol):
-    """In each lane, raise `target` (an offset) to |error| * factor / (atol + rtol * max(|before|, |after|))."""
+    """In each lane, raise the number at `target` to |error| * factor / (atol + rtol * max(|before|, |after|)).
+
+    `target`, `error`, `factor`, `before` and `after` are offsets.
+    """
     for k in range(0, LANES, 4):
         m, e, f, x, y = target * LANES + k, error * LANES + k, factor * LANES + k, before * LANES + k, after * LANES + k
         m0 = _raised_value(work, m, e, f, x, y, atol, rtol)
@@ -248,7 +251,8 @@ def _pivot_magnitude(work, entry, imaginary, k):
 def _choose_pivot(work, matrix, pivots, n, imaginary, c):
     """In each lane, exchange row c with the row from c on that has the largest entry in column c; invert this pivot.
 
-    Store that row's index in `pivots`. If the pivot is zero, set ACTIVE to 0. For `imaginary` see `factor_matrices`.
+    Store that row's index in `pivots`. If the pivot is zero, set ACTIVE to 0. If `imaginary` > 0, entries are complex,
+    with imaginary parts `imaginary` vectors after the real parts.
     """
     for k in range(LANES):
         best, largest = c, _pivot_magnitude(work, matrix + c * n + c, imaginary, k)
@@ -277,7 +281,7 @@ def _choose_pivot(work, matrix, pivots, n, imaginary, c):
 def factor_matrices(work, matrix, pivots, n, imaginary):
     """Replace a matrix (n, n) in each lane by its LU factors, with inverted pivots; store row exchanges in `pivots`.
 
-    Offset from the real to the imaginary part of an entry: `imaginary`; 0: the matrix is real.
+    If `imaginary` > 0, entries are complex, with imaginary parts `imaginary` vectors after the real parts.
     """
     for c in range(n):
         _choose_pivot(work, matrix, pivots, n, imaginary, c)
@@ -292,7 +296,8 @@ def factor_matrices(work, matrix, pivots, n, imaginary):
 def solve_systems(work, matrix, pivots, n, imaginary, x):
     """Replace a right-hand side x (n) in each lane by the solution, using the factors from `factor_matrices`.
 
-    If `imaginary` > 0, the system is complex (see `factor_matrices`), and n imaginary parts follow the real parts of x.
+    If `imaginary` > 0, the system is complex. Imaginary parts follow the real parts: of the matrix, `imaginary`
+    vectors behind; of x, n vectors behind.
     """
     imaginary_x = n if imaginary > 0 else 0
     for c in range(n):

@@ -46,7 +46,7 @@ from twoloop.kernels.steps.velocity_errors import LONGEST_GAPS, SLOW_FACTOR, STE
 # offsets of single vectors in the method's memory, before the blocks of vectors
 (
     ITERATING,  # 1 in lanes where Newton's iteration has not ended
-    DONE,  # 1 in lanes where Newton's iteration has converged
+    DONE,  # 1 in lanes where Newton's iteration has converged (not the status code of this name)
     CHANGE_BEFORE,  # largest correction by the previous iteration, relative to SCALE_Q and SCALE_V
     SCALE_Q,  # largest absolute position at the stages, at least 1
     SCALE_V,  # largest absolute velocity at the stages, at least 1
@@ -109,7 +109,7 @@ def _weights_offset(memory, n, s):
 
 @merged
 def matrix_offset(memory, n, s, index):
-    """Return the offset of a matrix (n, n); `index`: DERIVATIVE_Q, DERIVATIVE_V, or SYSTEMS + 2 k for system k."""
+    """Return the offset of a matrix (n, n); `index`: DERIVATIVE_Q, DERIVATIVE_V, or SYSTEMS + 2 k (linear system k)."""
     return _weights_offset(memory, n, s) + s * s + index * n * n
 
 
@@ -145,7 +145,7 @@ def _evaluate_middle_state(code, settings, control, c, work, new, a, memory):
 def compute_derivatives(code, settings, control, c, work):
     """Store DERIVATIVE_Q and DERIVATIVE_V, derivatives of accelerations by q and v, in the middle of the step.
 
-    The middle is the node nearest to it, because forces that act only between two nodes must not affect the step.
+    Use the node nearest to the middle, because forces that act only between two nodes must not affect the step.
     """
     n, order = settings[at.N], settings[at.ORDER]
     _, new, _, _, a, _, _, memory = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])
@@ -197,7 +197,7 @@ def factor_systems_of_lanes(settings, method_options, s, work):
 def predict_stages(settings, c, work, begins):
     """Store in STAGES a prediction of the stage accelerations: the polynomial through those in PREVIOUS.
 
-    If the step is longer than MAX_STEP_RATIO times the step of PREVIOUS, predict the accelerations at its beginning.
+    If the step is longer than MAX_STEP_RATIO times the step of PREVIOUS, the accelerations at its beginning are used.
     `begins` is 1 if PREVIOUS belongs to the last step, and 0 if it belongs to this step.
     """
     n = settings[at.N]
@@ -230,7 +230,7 @@ def predict_stages(settings, c, work, begins):
 
 @compiled
 def _compute_residuals(code, settings, control, A, A2, c, work):
-    """Store in RESIDUAL accelerations by the equations minus those in STAGES; update ACTIVE, SCALE_Q and SCALE_V."""
+    """Store in RESIDUAL accelerations by the equations minus STAGES; set SCALE_Q, SCALE_V; on failure, ACTIVE = 0."""
     n, order = settings[at.N], settings[at.ORDER]
     _, new, _, _, a, _, _, memory = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])
     s = c.size
@@ -304,7 +304,7 @@ def _raise_to_largest_value(work, target, begin, n):
 
 @compiled
 def _store_largest_corrections(settings, A, A2, work):
-    """Store in LARGEST_Q and LARGEST_V the largest changes of q and v due to CHANGES, divided by X^2 and by X."""
+    """Store in LARGEST_Q and LARGEST_V the largest changes of q, v due to CHANGES, divided by X^2 and X (A2 = A A)."""
     n = settings[at.N]
     memory = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])[7]
     s = A.shape[0]
@@ -320,7 +320,7 @@ def _store_largest_corrections(settings, A, A2, work):
 
 @merged
 def _has_iteration_ended(options, work, memory, iteration, k):
-    """Set DONE to 1 if Newton's iteration in lane k has converged, else to 0; return True if the iteration ends."""
+    """Set the field DONE to 1 if Newton's iteration in lane k has converged, else to 0; return True if it has ended."""
     x, tolerance = work[at.X * LANES + k], options[N_HEAD + OUTER_TOL]
     rounding_limit = MAX_ROUNDING_CORRECTION * options[LEAST]
     change_v = x * work[(memory + LARGEST_V) * LANES + k] / work[(memory + SCALE_V) * LANES + k]
@@ -374,7 +374,7 @@ def solve_stages(code, settings, control, options, method_options, A, A2, c, wor
 
 @compiled
 def store_state_from_stages(settings, b, bA, work):
-    """Store in NEW the state at the time X after the beginning of the step, given the stage accelerations STAGES."""
+    """Store in NEW the state at the time X after the step's beginning, from STAGES, with the weights b and bA = b A."""
     n = settings[at.N]
     _, new, _, _, _, _, _, memory = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])
     s = b.size
@@ -459,7 +459,7 @@ def _filtered_velocity_error(control, work, n, memory, z, state, new, k):
         largest_a = max(largest_a, abs(work[(begin + n + j) * LANES + k]))
         largest_error = max(largest_error, abs(work[(twice + j) * LANES + k]))
         difference = work[(twice + j) * LANES + k] - 2.0 * work[(once + j) * LANES + k] + work[(raw + j) * LANES + k]
-        largest_difference = max(largest_difference, abs(difference))  # |(z J)^2 e|; e: velocity error, J: Jacobian
+        largest_difference = max(largest_difference, abs(difference))  # |(z J)^2 E_V|; J: see `_filter_errors`
     if largest_error > 0.0:
         work[(memory + DURATION) * LANES + k] = z * np.sqrt(largest_error / largest_difference)
     duration = work[(memory + DURATION) * LANES + k]

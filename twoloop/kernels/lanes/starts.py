@@ -28,7 +28,7 @@ GOLDEN_SECTION = 0.6180339887498949  # inverse iterations start from irregular n
 
 @merged
 def _subtract_in_four_lanes(work, target, x, x_stride, y, y_stride, count):
-    """For four adjacent lanes, subtract `count` products work[x] * work[y] from work[target]; add strides to x, y."""
+    """For four adjacent lanes, subtract from work[target] `count` products work[x] * work[y]; x, y grow by strides."""
     t0, t1, t2, t3 = work[target], work[target + 1], work[target + 2], work[target + 3]
     for _ in range(count):
         t0 -= work[x] * work[y]
@@ -128,7 +128,7 @@ def factor_gram(work, pattern, moves, n_rows, n_redundant, G, row, factors):
 
 @compiled
 def _find_redundant_combinations(work, pattern, n_rows, n_redundant, row, factors):
-    """Store in `factors` Z, eigenvectors of G G^T for the n_redundant smallest eigenvalues; NaN if one is not small."""
+    """Store in `factors` Z, eigenvectors of G G^T for the n_redundant smallest eigenvalues; NaN if one is too large."""
     gram = factors + pattern[n_rows] - pattern[0] + n_rows
     Z = gram + n_rows * n_rows
     scratch = Z + n_redundant * n_rows
@@ -216,7 +216,7 @@ MAX_CURVATURE = 0.25
 MIN_EIGENVALUE = 1e-12  # constraints are independent if all eigenvalues of G G^T exceed this (rows of G have norm 1)
 N_WEAKEST_ITERATIONS = 10  # number of inverse iterations for the direction that the constraints determine least
 N_REDUNDANT = 5  # index of the number of redundant rows in `settings`; in this module, it replaces N_EVALUATIONS
-# factors (a, b) of three other guesses, p + a (p - p_0) + b d, where p_0 is the first guess, p its projection onto the
+# factors (x, y) of three other guesses, p + x (p - p_0) + y d, where p_0 is the first guess, p its projection onto the
 # constraints, and d the direction that the constraints determine least
 OTHER_GUESSES = ((-2.0, 0.0), (0.0, 1.0), (0.0, -1.0))
 
