@@ -28,10 +28,7 @@ UPPER, NO_TRANSPOSE = ord("U"), ord("N")
 
 
 def lapack_addresses() -> list[int]:
-    """Return the addresses of the ROUTINES in this process.
-
-    Raises ImportError if SciPy's LAPACK does not use 32-bit integers.
-    """
+    """Return the addresses of the ROUTINES in this process; raise ImportError unless they take 32-bit integers."""
     for name in ROUTINES:
         signature = repr(scipy.linalg.cython_lapack.__pyx_capi__[name])
         if "(int *" not in signature and "(char *, int *" not in signature:
@@ -85,7 +82,7 @@ def has_banded_mass(f):
 
 @inlined
 def _mass_band(w, b):
-    """Return a view of w.L in band storage: the upper triangle of M, and after a factorization its Cholesky factor."""
+    """Return a view of w.L: band storage (bandwidth b) of the upper triangle of M, later of its Cholesky factor."""
     n = w.Q.size
     return w.L.reshape(n * n)[: n * (b + 1)].reshape((n, b + 1))
 

@@ -89,7 +89,7 @@ def columns_of(index):
 
 @inlined
 def row_exchanges_of(index):
-    """Return the view of `index` for the row exchanges of dense factors, see `lu_factor`."""
+    """Return the view of `index` for the row exchanges of dense factors, which `lu_factor` stores."""
     return index[N_HEAD + 2 * index[SIZE] : N_HEAD + 3 * index[SIZE]]
 
 
@@ -141,7 +141,7 @@ def clear_lists(index, r):
 
 @compiled
 def put_entry(matrix, i, j, number, source):
-    """Add entry (i, j) = `number` to the lists (`source`: index of initial values); return False if a list is full."""
+    """Add entry (i, j) = `number` to the lists (source: index of its initial value); return False if one is full."""
     counts, lists, numbers = matrix
     n, m = counts[ROW_SIZE, i], counts[COLUMN_SIZE, j]
     if n == numbers.shape[1] or m == numbers.shape[1]:

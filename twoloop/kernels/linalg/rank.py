@@ -94,7 +94,7 @@ def _fill_coefficients(n, basis, factors, row, coefficients):
 def norm_of_inverse(factors, n, column):
     """Return the Frobenius norm of the inverse of the lower triangle `factors`, of n rows; `column` is scratch.
 
-    If `factors` belong to independent rows G, this norm times |b| bounds the shortest solution x of G x = b.
+    If `factors` belong to independent rows G, this norm times |c| bounds the shortest solution x of G x = c.
     """
     total = 0.0
     for j in range(n):
@@ -202,9 +202,9 @@ def _eigenvalue_bounds(mass):
 
 @compiled
 def _count_weak_eigenvalues(mass, weak_ratio, A):
-    """Return the number of eigenvalues of the mass matrix M below a limit b, and store the factors of M - b I in A.
+    """Return the number of eigenvalues of the mass matrix M below a limit z, and store the factors of M - z I in A.
 
-    b is `weak_ratio` times an upper bound on the largest eigenvalue.
+    z is `weak_ratio` times an upper bound on the largest eigenvalue.
     """
     _, largest = _eigenvalue_bounds(mass)
     copy_matrix(mass, A)
@@ -228,9 +228,9 @@ def _sort_rows_by_entries(G, order, counts):
 
 @merged
 def _removes_weak_eigenvalue(A, g, scale, x):
-    """Return True if adding scale * g g^T to the mass matrix M removes one of its eigenvalues below the limit b.
+    """Return True if adding scale * g g^T to the mass matrix M removes one of its eigenvalues below the limit z.
 
-    Then det(M - b I) changes its sign. A contains the factors of M - b I; `x` is scratch.
+    Then det(M - z I) changes its sign. A contains the factors of M - z I, see `_count_weak_eigenvalues`; x is scratch.
     """
     for j in range(x.size):
         x[j] = g[j]
@@ -397,7 +397,7 @@ def _first_bound_below_pivots(S, kept, n_kept, largest_inverse, bounds, scratch)
     """Return the index of the first of `bounds` that is below all pivots of S; bounds.size if none is.
 
     S is the matrix G M^-1 G^T of the rows `kept` of G, scaled to a diagonal of 1. No pivot is below the smallest
-    eigenvalue of S, and this eigenvalue exceeds a bound b if S - b I is positive definite. It is at most the smallest
+    eigenvalue of S, and this eigenvalue exceeds a bound z if S - z I is positive definite. It is at most the smallest
     pivot, 1 / `largest_inverse` (0: unknown), so that larger bounds need no test.
     """
     shifted = scratch[: n_kept * n_kept].reshape((n_kept, n_kept))
@@ -418,9 +418,9 @@ def _first_bound_below_pivots(S, kept, n_kept, largest_inverse, bounds, scratch)
 
 @merged
 def _select_dependent_rows(G, min_sine, basis, factors, coefficients, C, kept, is_kept):
-    """Set `is_kept` to 1 for the rows of G that `select_rows` selects, else to 0; store C as in `_find_dependent_rows`.
+    """Set `is_kept` to 1 for the rows of G that `select_rows` selects with `min_sine`, else to 0.
 
-    The other arguments are scratch.
+    C[i, k] receives the coefficient of row k in a redundant row i, both scaled to norm 1. Other arguments: scratch.
     """
     n_kept = select_rows(G, min_sine, basis, factors, kept)
     for k in range(len(G)):

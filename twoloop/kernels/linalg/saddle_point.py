@@ -98,7 +98,7 @@ def _reduce_dense_mass(columns, independent, M, D, A, MT):
 
 @merged
 def factor_reduced_mass(f, w):
-    """Store in w.A the L D L^T factors of the mass matrix for independent velocities; return a code."""
+    """Store in w.A the L D L^T factors of T^T M T, with allowed velocities T = [I; D^T]; return a code."""
     columns = columns_of(w.index_v)
     if f.diagonal_mass == 1:
         _reduce_diagonal_mass(columns, w.independent_v, w.M, w.D, w.A, w.x)
@@ -286,7 +286,7 @@ def _write_augmented_program(w):
 
 @compiled
 def _run_augmented_program(w):
-    """Factor the augmented matrix in w.values_a; return False if a pivot is 0 or not finite, or a multiplier large."""
+    """Factor the augmented matrix in w.values_a; return False if a pivot is zero or NaN, or a multiplier too large."""
     index, values, scale, first_of_mass = w.index_a, w.values_a, w.mass_scale, w.entries.size
     source = index_of_entries(index[at.SIZE]) + 2 * index[at.N_SLOTS]
     for s in range(index[at.N_SLOTS]):

@@ -173,7 +173,7 @@ def add_terms_of_redundant_rows(program, jacobian, is_independent, stiffness, rh
 
 @compiled
 def subtract_product(program, mass, jacobian, is_independent, x, b):
-    """Subtract [M G^T; G 0] x from b in place; then set the entries of redundant rows of G in b to zero."""
+    """Subtract [M G^T; G 0] x from the vector b in place; then set the entries of redundant rows of G in b to zero."""
     n_q = program[N_COORDINATES]
     rows, columns, _ = mass_entries_of(program)
     for k in range(rows.size):

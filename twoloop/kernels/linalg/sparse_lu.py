@@ -7,8 +7,8 @@ M is the mass matrix, and G the constraint Jacobian. K and D are the derivatives
 velocities; z is proportional to the step size. symbolic_factorization.py chooses the order of elimination, by the
 pattern alone; its argument `couplings` contains the entries of K and D. Pivots are single entries. The program lists
 the entries of M, then of K and D. It ends with groups of columns of K and D: no two columns of a group have an entry in
-the same row. So differences after one displacement, of all coordinates of a group, yield all columns of the group
-(Curtis, Powell & Reid 1974, doi 10.1093/imamat/13.1.117).
+the same row. So one displacement, of all coordinates of a group, yields all its columns by finite differences (Curtis,
+Powell & Reid 1974, doi 10.1093/imamat/13.1.117).
 """
 
 from collections.abc import Iterable, Sequence

@@ -408,7 +408,7 @@ def pivot_order_of(program):
 
 @inlined
 def factor_columns_of(program):
-    """Return for each column of L the number of its first entry (last: of entries); and, for each entry, its row."""
+    """Return where each column of L begins, then the end of the last; and the row of each entry, as a pivot number."""
     begin = N_HEAD + program[N_PIVOTS]
     middle = begin + program[N_PIVOTS] + 1
     return program[begin:middle], program[middle : middle + program[N_OFF_DIAGONAL]]
@@ -439,10 +439,7 @@ def jacobian_entries_of(program):
 
 @inlined
 def stiffening_products_of(program):
-    """Return, for each product of two entries of G that is added to M: row, indices of both entries, slot.
-
-    A slot is the index of a number in the array of the factors.
-    """
+    """Return, for each product of two entries of G that is added to M: row, both entries, index in the factors."""
     n = program[N_STIFFENED]
     begin = N_HEAD + 2 * program[N_PIVOTS] + 1 + program[N_OFF_DIAGONAL] + program[N_RUNS]
     begin += 3 * (program[N_OF_MASS] + program[N_OF_JACOBIAN])
