@@ -71,7 +71,7 @@ def start(f, w, t, state):
     """Factorize M, choose the partition, and store a and lam in `state`; return DONE or a code for the failure."""
     n = w.Q.size
     q, v = state[:n], state[n : 2 * n]
-    w.last_jump = t  # a drive may start suddenly: treat t as a jump of C_t and b (of A v + b = 0)
+    w.last_jump = t  # a drive may start suddenly: treat t as a jump of the constraint rates C_t and b
     code = prepare_mass(f, w, t, q)
     if code == DONE:
         code = renew_partition(f, w, t, q)
@@ -86,7 +86,7 @@ def start(f, w, t, state):
 
 @merged
 def _locate_rate_jump(f, w, t, size, tolerances, accepted, state, new_state):
-    """Return JUMP, RAMP or SMOOTH for C_t and b in a step (`accepted` or not), and the ends (s) of the jump or ramp."""
+    """Return JUMP, RAMP or SMOOTH for C_t, b in a step (`accepted` or not), and the ends (s) of a jump or ramp."""
     n = w.Q.size
     q, v = state[:n], state[n : 2 * n]
     if not accepted:
@@ -205,7 +205,7 @@ def _can_take_many_steps(control, clock):
 
 @merged
 def _pass_output_time(f, w, clock, outputs, state):
-    """Record the smallest pivot at an output time; go on to the next output time; return True if there is none."""
+    """Record the smallest pivot at an output time; go on to the next output time; return True if none is left."""
     record_pivot_at_output(f, w, clock, state)
     clock[at.NEXT_OUTPUT] += 1.0
     return int(clock[at.NEXT_OUTPUT]) == outputs.size
@@ -361,7 +361,7 @@ def advance(
             out_t[filled[0]] = clock[at.T]
             copy(state, out_state[filled[0]])
             filled[0] += 1
-        # if a step was shortened, for example to end at an output time, the next step may be as long as intended here
+        # if this step was shortened, for example to end at an output time, the next one may be as long as was intended
         clock[at.H_NEXT] = max(proposed_size, h) if shortened else proposed_size
         clock[at.LIMIT_AGE] += 1.0
         if clock[at.LIMIT_AGE] > control[at.LIMIT_MEMORY]:

@@ -114,7 +114,7 @@ def _set_step_limits(control, tolerances, span, longest, within):
 
 @kernel(f8(VECTOR, VECTOR, VECTOR, i8, f8, f8, f8, f8, types.boolean))
 def first_step_and_limits(control, tolerances, state, n, t, t1, smallest, longest, within):
-    """Return the result of `_first_step_size` (s); if `longest` > 0, also call `_set_step_limits`."""
+    """Return the first step size (s), see `_first_step_size`; if `longest` (max_step) > 0, also `_set_step_limits`."""
     if longest > 0.0:
         _set_step_limits(control, tolerances, t1 - t, longest, within)
     return _first_step_size(state, n, t, t1 - t, smallest)
@@ -161,7 +161,7 @@ NOTHING_CHECKED, STATE_CHECKED, CHOICES_CHECKED = 0, 1, 2
 
 # arrays for the checks of a start, for the choice of rows and for steps; successive runs reuse them. Among them are
 # - `numbers`: array whose parts are clock, control and tolerances; `start_numbers`: values of `numbers` at a start
-# - `start_memory`: values at a start of the method's `memory`, at the indices `memory_places`; other entries are then 0
+# - `start_memory`: values at a start of the method's `memory`, at the indices `memory_places`; its other entries are 0
 # - `last_start`: t, t1, q and v of the last start; `start_rows`: indices of the independent constraint rows there
 # - `saved`, `saved_integers`: all data computed at a start; if more runs begin at this start, they restore these data
 RUN_ARRAYS = Reference(
@@ -256,7 +256,7 @@ def _start_run(f, checked_kit, w, b, t, t1, q, v, records, checks):
     """Prepare a run from t to t1 with the setup of the last run; return 0, or REFUSED, IN_DOUBT or UNCHOSEN.
 
     `checked_kit`: kit whose callbacks check the start; `checks`: what Python has already checked, for example
-    STATE_CHECKED; `records`: see `evaluate_start`.
+    STATE_CHECKED; `records`: sizes and nonzero entries at earlier positions, see `evaluate_start`.
     """
     n = q.size
     if not (finite_vector(q) and finite_vector(v)):

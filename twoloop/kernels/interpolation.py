@@ -250,7 +250,7 @@ def _has_similar_gaps(t, lo, hi):
 def estimate_errors(f, w, tolerance, tolerances, t, states, groups, z, coefficients, rows, out):
     """Store in out[g] the estimated error of the polynomials of interval g of `groups`, in units of the tolerances.
 
-    The estimate is the first of these that applies:
+    The estimate is the first of these that applies (`tolerance`: of the projection; z, coefficients, rows: scratch):
     - 0 if the polynomials do not interpolate accelerations (kinds SEPARATE and VELOCITIES), and have more than two
       interpolated states at about equal distances, none of them inside the interval;
     - if there are more than two of these: how much the last one changes the polynomials. This applies if it is at most

@@ -142,7 +142,7 @@ class CachedIntegrator:
     @staticmethod
     def can_provide(run: Run, output: OutputRequest, shared: SharedSetup | None) -> bool:
         """Return whether a cached integrator, which reuses its arrays, can provide the requested `output`."""
-        # interpolated output and `sol` must agree, but here each would have its own interpolator. If setup is shared,
+        # interpolated output and `sol` must agree, but each would get an interpolator of its own. If setup is shared,
         # the next run overwrites the parameters that `sol` would use
         if output.dense and (output.interpolated_times is not None or shared is not None):
             return False
@@ -238,7 +238,7 @@ class CachedIntegrator:
         is_due: bool,
         fields: dict[str, Any],
     ) -> dict[str, Any] | RepeatRequest | tuple[tuple[Array, Array] | None] | None:
-        """Check the first chunk of a run; let `IntegrationLoop` continue the run if it is incomplete or suspicious.
+        """Check the first chunk of a run; if it is incomplete or needs more checks, continue by `IntegrationLoop`.
 
         If the loop continued, or a check failed, return what `integrate` has to return: fields, a request, or None (the
         start needs more checks). Otherwise store `sol` in `fields` if it is requested, and return a tuple with one
@@ -319,7 +319,7 @@ class CachedIntegrator:
         def states(all_states: bool) -> Array:
             sample = Sample(float(t[0]), rows[0], n)
             sample.add(t[1:], rows[1:], float(t[-1]), rows[-1])
-            # also check the states with extreme t, q or v: then the checked region contains a repetition of the run
+            # also check states with extreme t, q or v: then a repetition of the run lies within the checked region
             return sample.states() if all_states else np.concatenate([extreme_states(t, rows[:, :n]), sample.states()])
 
         checks = t1, self.check_derivatives, REACHED_END, "", is_due, is_inside
@@ -442,7 +442,7 @@ def _choice_as_array(choice: PivotChoice | None) -> tuple[NDArray[np.int64], flo
     """
     if choice is None:
         return np.zeros(0, dtype=np.int64), 1.0
-    # kernels cannot repeat a refined choice, for which Python may try several sets of such rows: OF_PYTHON
+    # kernels cannot repeat a refined choice, for which Python may try several ways to add terms to M: OF_PYTHON
     index = cached_run().OF_PYTHON if choice.is_refined else int(np.searchsorted(-MIN_PIVOTS, -choice.min_pivot))
     numbers = index, len(choice.rows), len(choice.added_rows), *choice.rows, *choice.added_rows
     return np.array(numbers, dtype=np.int64), (*choice.scales, 1.0)[0]

@@ -92,9 +92,9 @@ class Interpolator:
         self.matrices = max((plan.matrices for plan in self.plans.values()), default=0)
         self._create_workspace()
         self.failures, self.warns = 0, True  # number of states at which the last call failed; whether to warn of this
-        # keys of these two dicts: times at which intervals begin. Values here: (times, states), including both ends
+        # keys of these two dicts: times at which intervals begin. Values of the first: (times, states), with both ends
         self.interior_states: dict[float, tuple[Array, Array]] = {}
-        # arrays `memory` of crossing steps (steps across a singular position), which contain the polynomials there
+        # values of the second: `memory` of crossing steps (across a singular position), which contains their polynomial
         self.crossing_memories: dict[float, Array] = {}
         self.accurate_intervals: set[float] = set()  # times at which intervals that need no interior states begin
         self.may_divide = True  # whether interior states may be computed; False if they were read from a file

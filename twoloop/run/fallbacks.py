@@ -100,10 +100,10 @@ LARGEST_RATIO = max(SIZE_RATIOS)
 # Its steps are then too short to suggest a size across the position, so much larger sizes are tried, too
 FIRST_STEPS = 30.0
 LARGE_RATIOS = tuple(1.2**k for k in range(12, 30))
-# "distance" of a state from a singular position: smallest pivot of C_q, relative to the largest such pivot of the run.
+# "distance" of a state from a singular position: smallest pivot of C_q, relative to its largest value in the run.
 # The base, the state at which the polynomial across the position begins, should have at least the distance FAR_BEFORE
 FAR_BEFORE = 0.2
-# factors of wider limits: on tolerances, and on the time between evaluations (unlimited if no force can be short)
+# wider limits: factor of the tolerances; factor of the time between evaluations (infinite if no force can be short)
 TOLERANCE_FACTOR, GAP_FACTOR = 10.0, 4.0
 NODE_DISTANCES = 1.0, 0.5, 0.25  # values of Limits.node_distance that are tried in turn
 
@@ -194,7 +194,7 @@ def cross_singularity(run: Run, past: list[TimedState]) -> tuple[Plan, Array]:
     control[: a.N_RULE] = plan.rule
     control[a.SYMMETRIC], control[a.MAY_CROSS], control[a.MAX_ATTEMPTS] = 0.0, 0.0, 1.0
     control[a.MAY_SWITCH] = control[a.TAKES_MANY] = 0.0
-    run.piece_ends = []  # forget those of the last run, if a cached integrator reuses `run`
+    run.piece_ends = []  # forget pieces of an earlier run: cached integrators reuse `run`
     if control[a.FIXED_STEP] == 0.0:
         control[a.MAX_EVALUATION_GAP] = 1.0 if run.forces_may_be_steep else NODE_GAP / (1.0 - BACKWARD_FRACTION)
     clock[a.LIMIT_AGE] = 0.0
@@ -214,7 +214,7 @@ def _limits(run: Run) -> list[Limits]:
 
 
 def _is_near_start(run: Run) -> bool:
-    """Return whether the run is so far shorter than FIRST_STEPS times its longest recent step."""
+    """Return True if the time since the start is less than FIRST_STEPS times the longest recent step."""
     a, clock = run.a, run.clock
     return bool(clock[a.T] - clock[a.T_START] < FIRST_STEPS * clock[a.H_LONG])
 
@@ -323,7 +323,7 @@ def handle_crossing(run: Run, plan: Plan, control: Array, code: int, n_accepted:
             clock[a.H_NEXT], clock[a.H_LIMIT] = run.piece_ends[0] - clock[a.T], np.inf
             return plan, control, a.PAUSED
     run.piece_ends, stored[kernels.END] = [], -np.inf
-    at_singular_start = run.starts_singular and clock[a.T] == run.t0  # code RANK_LOST is normal here
+    at_singular_start = run.starts_singular and clock[a.T] == run.t0  # no partition exists at t0 then
     if at_singular_start and code == a.RANK_LOST:
         code = a.PAUSED
     if n_accepted > 0:  # the whole polynomial counts as one step

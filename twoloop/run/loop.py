@@ -107,7 +107,7 @@ class Interrupts:
         """
         if self.handlers is None and raised_by_handler(error):
             return False
-        self.install_handlers()  # raises if a signal arrives here, and a user's handler or `_on_signal` raises
+        self.install_handlers()  # may raise: a signal that arrives now calls a user's handler or `_on_signal`
         return self._is_installed and self.n_signals <= MAX_STORED_SIGNALS
 
     def restore_handlers(self) -> None:

@@ -90,7 +90,7 @@ MIN_STABILITY_RATIO = 0.45
 
 
 class StiffnessSample(NamedTuple):
-    """Sampled state of a run, with the step size, and the stability limits of the method there."""
+    """Sampled state of a run, the step size at this state, and the stability limits of the method."""
 
     t: float
     q: Array
@@ -266,7 +266,7 @@ def describe_rounding(run: "Run", states: list[TimedState], end: float) -> str:
     system, n = run.system, run.system.n_q
     for t, state in sorted({each[0]: each for each in states}.values(), key=itemgetter(0)):
         q, v = state[:n], state[n : 2 * n]
-        at_singular_start = t == run.t0 and run.starts_singular  # v is given there, not computed
+        at_singular_start = t == run.t0 and run.starts_singular  # v is given at such a start, not computed
         if t >= end or at_singular_start or certainly_exceed(run.near_threshold, system.rows(t, q), run.rank):
             continue
         error_ratio = _velocity_error_ratio(run, t, q, v)

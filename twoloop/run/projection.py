@@ -430,7 +430,7 @@ def _describe_change(before: Array, after: Array, scales: Scales) -> str:
 def _gauss_newton(
     system: ConstrainedSystem, t: float, q: Array, free: NDArray[np.intp], cutoff: float = LSTSQ_CUTOFF
 ) -> tuple[Array | None, float, int]:
-    """Return the projected q (None: diverged), violation / allowed violation there, and the number of iterations."""
+    """Return the projected q (None: diverged), violation / allowed violation at this q, number of iterations."""
     least_excess, best_q, guess = np.inf, q, q
     for iteration in range(1, MAX_ITERATIONS + 1):
         try:

@@ -43,7 +43,7 @@ Buffers = tuple[Array, Array, Array]  # times, states and steps
 # largest number of attempted steps in the first chunk (call of compiled code) of a small system. With fewer, the checks
 # after each chunk cost more: they take 0.2 ms in Python
 FIRST_CHUNK = 1024
-FIRST_CHUNK_IN_PYTHON = 64  # the same number if callbacks are Python functions, which are slow
+FIRST_CHUNK_IN_PYTHON = 64  # value of FIRST_CHUNK if callbacks are Python functions, which are slow
 SMALL_SYSTEM = 32  # largest number of coordinates of a small system; larger systems have proportionally smaller chunks
 TRIAL_STEPS = 10  # a method that is fast only with long steps is replaced if one of its first 10 steps is short
 NO_PATTERN = np.zeros((0, 0))  # the fixed-order form needs no pattern of the nonzero entries of constraint rows
@@ -125,7 +125,7 @@ class Run:
         self.t1 = np.inf  # end of the run (s)
         self.starts_singular = False  # whether the start is a singular position: C_q has a higher rank beside it
         self.branch_known = False  # whether it is known on which branch the motion leaves a singular start
-        self.jumps: list[float] = []  # times (s) at which velocities jumped with C_t or b of A v + b = 0
+        self.jumps: list[float] = []  # times (s) at which velocities jumped because C_t, or b in A v + b = 0, jumped
         self.compared_until = [-np.inf]  # callbacks and traces were compared up to this time; copies share the list
         self.region: CheckedRegion | None = None  # where callbacks and traces were compared; integrators share it
         self.varied_parameters: Array | None = None  # parameters, if systems that differ in them share this run
@@ -283,7 +283,7 @@ class Run:
             clock[a.FAILURE_CODE] = indices.DONE
         state = self.state.copy()
         code = entry_point(self.kernels.start)(self.kit, self.work, t, state)
-        if code == indices.RANK_DIFFERS:  # keep the rank of the start: rows dependent there may be independent here
+        if code == indices.RANK_DIFFERS:  # keep the start's rank, though more rows may be independent now
             self.work.notes[indices.GENERATION] = 1.0
             code = entry_point(self.kernels.start)(self.kit, self.work, t, state)
         if old_work.notes[indices.PIVOT] > 0.0 and largest_pivot > 0.0:  # convert largest_pivot to the new form's scale

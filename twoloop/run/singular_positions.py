@@ -110,7 +110,7 @@ def describe_velocity_jump(
         threshold = (
             min(LOST_RANK_RATIO, np.sqrt(rtol + float(atol.max()) / largest_q)) if largest_q > 0.0 else LOST_RANK_RATIO
         )
-        # ordinary steps (`across` False) may have switched branches: then no interpolation between the states is valid
+        # ordinary steps (`across` False) may have switched branches, so do not interpolate: use the last state only
         here, there = (t0, first), (t1, last)
         ratio = _least_ratio_between(system, here if across else there, there, rank, unit_free_ratio)
         if ratio >= threshold:
@@ -227,7 +227,7 @@ def velocity_rounding_errors(system: ConstrainedSystem, t: float, q: Array, v: A
             row_slopes = np.abs(np.subtract(*(system.rows(t, each) for each in displaced)))
         except (ArithmeticError, ValueError):  # a square root, for example, fails beyond a dead centre
             return np.full(len(q), np.nan)
-        # entries of the Jacobian, to which rounding errors of constraints are proportional, may be small here by chance
+        # entries of the Jacobian, to which rounding errors of constraints are proportional, may be small at q by chance
         nearby_rows = np.abs(rows) + (row_slopes * (np.abs(rows).max() / row_slopes.max()) if row_slopes.any() else 0.0)
         rounding = ROUNDING * np.sqrt((nearby_rows * nearby_rows) @ (q * q))
         errors = np.maximum(

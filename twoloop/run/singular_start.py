@@ -59,7 +59,7 @@ def branch_at(system: ConstrainedSystem, t: float, state: Array, rank: int, allo
     """Return the branch of the motion through the singular position of `state` = [q, v, a]; `rank`: rank of C_q there.
 
     Return None if no rise of the rank along the motion is found: q is not singular, or the motion stays in singular
-    positions, or C depends on t, or n_a > 0. Return False if the branch is not certain: another one may have velocities
+    positions, C depends on t, or A exists. Return False if the branch is not certain: another one may have velocities
     closer to v than the tolerances `allowed` (n_q,), or no state on the branch was found.
     """
     if system.n_a > 0 or "constraint_rate" in system.given or not 0 < rank < min(system.n_c, system.n_q):

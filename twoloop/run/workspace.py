@@ -85,7 +85,7 @@ def newton_form(
 def _derivative_entries(
     system: ConstrainedSystem, t: float, q: Array, v: Array, lam: Array, max_entries: float
 ) -> set[tuple[int, int]]:
-    """Return the indices (i, j) of entries that are nonzero in d(Q - C_q^T lam)/dq or dQ/dv, or in their transposes.
+    """Return the indices (i, j) of nonzero entries of d(Q - C_q^T lam)/dq, dQ/dv (Q: forces), and their transposes.
 
     Find them column by column; stop once they are more than `max_entries`.
     """
@@ -117,7 +117,7 @@ MASSLESS_RATIO = 1e-10
 # if M is singular, g^T g may be added to M for a row g of C_q whose component along massless directions is longer than
 # this fraction of g
 MIN_MASSLESS_FRACTION = 1e-3
-MIN_SIZE_NEWTON = 1.6  # Newton's matrix may be sparse if n_q exceeds this times LARGE (callbacks.py)
+MIN_SIZE_NEWTON = 1.6  # Newton's matrix may get sparse factors if n_q > this times LARGE (problem/callbacks.py)
 MAX_SHARE = 0.05  # sparse factors of M and C_q are used if they need at most this times the operations of dense ones
 
 
@@ -382,7 +382,7 @@ def kit_for_plan(system: ConstrainedSystem, flags: Array, plan: Plan | None) -> 
 
 
 def _steps_of_plan(plan: Plan) -> tuple[Any, Any, Any]:
-    """Return the steps `step`, `first` and `second` of a plan; None instead of a second one that is not loaded yet."""
+    """Return a plan's step, and both steps of its pair of methods (None: no pair, or the second is not loaded yet)."""
     return load_step(plan.step), load_step(plan.first), step_if_loaded(plan.second)
 
 

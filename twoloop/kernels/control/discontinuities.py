@@ -37,7 +37,7 @@ N_PARTS = 12  # C_t and b are sampled at the ends of this number of equal parts 
 BINOMIAL = (1.0, -12.0, 66.0, -220.0, 495.0, -792.0, 924.0, -792.0, 495.0, -220.0, 66.0, -12.0, 1.0)
 MAX_BISECTIONS = 60  # largest number of bisections that locate a jump or a ramp of C_t or b
 RATE_ROUNDING = 1e-11  # error of the twelfth difference due to rounding of samples, relative to the largest sample
-TIME_ROUNDING = 5e3  # error of the twelfth difference due to rounding of t, divided by np.spacing(t) times mean slope
+TIME_ROUNDING = 5e3  # error of the twelfth difference due to rounding of t, relative to np.spacing(t) * (mean slope)
 STEEPNESS = 4.0  # a part of a step is a ramp if C_t or b is this number of times steeper there than in the whole step
 MAX_RAMP_SHARE = 0.125  # a step must end at a ramp of C_t or b that takes at most this fraction of the step
 MIN_SPACINGS = 8.0  # bisection ends at an interval of this number of spacings of floating-point numbers
@@ -95,7 +95,7 @@ def _allowed_error(f, w, tolerances, x, row):
 
 @compiled
 def unexplained_velocity_change(tolerances, h, state, new_state, n):
-    """Return the largest difference, in tolerances, between a change of velocity and h times the mean acceleration."""
+    """Return the largest difference, in tolerances, of a velocity's change in a step and h times mean acceleration."""
     largest = 0.0
     for m in range(n):
         v, v1, a, a1 = state[n + m], new_state[n + m], state[2 * n + m], new_state[2 * n + m]

@@ -56,7 +56,7 @@ H_BEFORE, ERROR_BEFORE, N_PAST = range(3)
     JUMP_RATIO,  # largest ratio of a step's true error to its error estimate if a force jumps within the step
     SPACING,  # time (s) between samples of the forces ahead of a step, see discontinuities.py; 0: no samples
     TIME_SPACING,  # longest time (s) between samples of the forces at a fixed state, see discontinuities.py
-    # 1: forces may be sampled along the predicted motion; 0: never, because a callback raised an exception there
+    # 1: forces may be sampled along the predicted motion; 0: not any more, as a callback raised an exception
     SAMPLE_MOTION,
     BY_TIME,  # 1: a force or a constraint rate (C_t, b) may change suddenly with time; 0: none does
     BY_STATE,  # 1: a force may change suddenly with q or v: steps longer than SPACING sample the motion; 0: none does

@@ -37,7 +37,7 @@ from twoloop.kernels.evaluation.inner_loop import evaluate, restore_constraints
 from twoloop.kernels.evaluation.tasks import PROJECT
 from twoloop.kernels.linalg.markowitz_lu import determinant_sign
 
-KEEP_BELOW_RATIO = 1.2  # methods with a trend keep the step size if it could grow by at most this factor
+KEEP_BELOW_RATIO = 1.2  # methods that use the trend of errors keep the step size if it could grow by at most this
 
 
 @compiled
@@ -144,7 +144,7 @@ def count_step(w, tolerances, control, clock, size, out_step):
 
 # allowed error of a predicted position, relative to the largest displacement of any coordinate in the step
 FRACTION_OF_MOTION = 0.1
-FRACTION_AT_SIGN_CHANGE = 1e-6  # replaces FRACTION_OF_MOTION if the sign of det C_qd changes in the step
+FRACTION_AT_SIGN_CHANGE = 1e-6  # replaces FRACTION_OF_MOTION if det C_qd (dependent columns of C_q) changes sign
 LEAST = 1e-300  # lower bound of the allowed error of a predicted position, which avoids a division by zero
 # this fraction of the tolerance is added to FRACTION_OF_MOTION times the displacement, for steps that hardly move
 FIXED_FRACTION = 0.01
@@ -163,7 +163,7 @@ def prediction_error(w, tolerances, h, q, v, q1):
 
     The step of size h leads from (q, v) to q1. The error is the difference of w.predicted and q1, whose positions
     satisfy the constraints. The allowed error is the tolerance or, if smaller, about FRACTION_OF_MOTION times the
-    displacement in the step. The factors of C_qd in `w` must belong to q1. For steps of fixed size, return 0.
+    displacement. `w` must contain factors of the dependent columns of C_q at q1. For steps of fixed size, return 0.
     """
     if tolerances[ESTIMATE] == 0.0:
         return 0.0

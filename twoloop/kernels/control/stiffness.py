@@ -56,7 +56,7 @@ FIRST_ESTIMATE, BETWEEN_ESTIMATES = 100.0, 600.0
 N_POWER_ITERATIONS = 4  # number of power iterations by dF/dq per estimate (F: accelerations); largest number by dF/dv
 NEGLIGIBLE_DAMPING = 1e-3  # power iterations with dF/dv end early if the eigenvalue times the step size is below this
 ZERO_REPLACEMENT = 1e-3  # replaces zero components of the vector of a power iteration, whose largest component is 1
-STABILITY_LIMIT = 3.0  # if step size * rho exceeds this multiple of the stability limit, a trial begins at any cost
+STABILITY_LIMIT = 3.0  # a trial begins at any cost if step size * (largest rate) exceeds this times its stability limit
 # if Jacobians are computed by finite differences (about eight evaluations per coordinate), a trial that STABILITY_LIMIT
 # does not require also waits until the run has cost this number of evaluations per independent coordinate
 MIN_COST_PER_COORDINATE = 64.0
@@ -67,12 +67,12 @@ COUNTED_FRACTION_OF_RUN = 0.3  # the cost so far counts as at least this fractio
 # after the run has cost this multiple of MIN_COST_IN_TRIALS trials, a trial begins, whatever the largest rate rho is.
 # After k trials, the next one begins at k + 1 times this cost
 COST_OF_ANY_TRIAL = 100.0
-MIN_RATIO_TO_MOTION = 30.0  # rho is "hidden" (the motion does not show it) above this multiple of `_motion_rate`
+MIN_RATIO_TO_MOTION = 30.0  # above this times `_motion_rate`, the largest rate is "hidden": the motion does not show it
 QUIET_FACTOR = 10.0  # vibrations count as small if their velocities are at most this number of tolerances
-# if rho is hidden, or has small vibrations, a trial begins at step size * rho above this part of the stability limit
-MIN_HIDDEN_RATIO = 0.05
-DIFFERENCE_STEP = 1e-4  # time step of the finite difference in `_motion_rate`, relative to 1 / rho
-RETURN_BELOW = 0.4  # the explicit method is tried again at step size * rho below this part of the stability limit
+# if the largest rate is hidden, or that of small vibrations, a trial begins if step size * (largest rate) exceeds this
+MIN_HIDDEN_RATIO = 0.05  # (relative to the stability limit)
+DIFFERENCE_STEP = 1e-4  # time step of the finite difference in `_motion_rate`, relative to 1 / (largest rate)
+RETURN_BELOW = 0.4  # the explicit method is tried again if step size * (largest rate) is below this part of its limit
 # errors of the implicit method on trial are multiplied by this factor, so that it cannot win by making larger errors
 TRIAL_ERROR_FACTOR = 10.0
 MEAN_WEIGHT = 0.8  # after a step: new mean step size = MEAN_WEIGHT * old mean + (1 - MEAN_WEIGHT) * size of the step
@@ -87,7 +87,7 @@ EXPLICIT, ON_TRIAL, IMPLICIT, BACK_ON_TRIAL = range(4)
 
 # `options` contains N_PAIR options of the pair (indices below); N_OF_EACH numbers for each method, namely parameters of
 # step-size control (loop_state.py) and, at REUSE_OF, w.reuse; and the options of the first and the second method.
-# - LIMIT: stability limit of step size * rho; after N_ESTIMATES estimates above LIMIT, the implicit method is tried
+# - LIMIT: stability limit of step size * (largest rate). After N_ESTIMATES estimates above it, a trial begins
 # - MATRIX_COST: cost of a Jacobian, in evaluations of accelerations
 # - COST_RATIO: cost of an evaluation by the second (implicit) method, in evaluations by the first (explicit) one
 # - SIZE_1: number of options of the first method
@@ -310,7 +310,7 @@ def _phase_to_begin(f, w, options, memory, tolerances, t, state, new_state):
     memory[T_BEGIN], memory[COST_BEGIN] = t, cost
     memory[NEXT_ESTIMATE] = w.n_evaluations + _evaluations_between_estimates(options, memory)
     memory[ESTIMATES_TO_WAIT] -= 1.0
-    h_rho = memory[H_MEAN] * memory[RATE] / options[LIMIT]  # h rho as a multiple of the stability limit
+    h_rho = memory[H_MEAN] * memory[RATE] / options[LIMIT]  # step size * (largest rate), over its stability limit
     if h_rho > 1.0:
         memory[N_ABOVE_LIMIT] += 1.0
     if memory[ESTIMATES_TO_WAIT] > 0.0:
@@ -329,7 +329,7 @@ def _phase_to_begin(f, w, options, memory, tolerances, t, state, new_state):
         is_hidden = _has_small_vibrations(w, tolerances, state, memory[RATE])
         if not is_hidden:
             is_hidden = memory[RATE] > MIN_RATIO_TO_MOTION * _motion_rate(f, w, t, state, memory[RATE], Q, V, A)
-    # a costly run starts a trial at any value of rho: friction is stiff only while it reverses, and few estimates fall
+    # a costly run starts a trial at any largest rate: friction is stiff only while it reverses, and few estimates fall
     # into this time. The condition cost > min_cost excludes short steps at the start, which make a run look costly
     is_costly = is_cheap and cost > min_cost and counted > COST_OF_ANY_TRIAL * min_cost * (1.0 + memory[N_TRIALS])
     is_due = (
@@ -367,7 +367,7 @@ def commit_switching(f, w, options, memory, tolerances, accepted):
 
 @kernel(ATTEMPT)
 def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """Attempt a step by the active method; first change this method if an estimate of rho or a trial requires it.
+    """Attempt a step by the active method; first change this method if its rate estimate or a trial requires it.
 
     The memory of a method is set to zero when this method becomes active. Each method has its own step-size control.
     """

@@ -98,14 +98,14 @@ class Work(NamedTuple):
     notes: Any  # (N_NOTES) values that one kernel stores for another, see indices.py
     nodes: Any  # results of all operations of a traced program, see evaluation/operations.py
     matrices: Any  # matrices of Newton's method in implicit steps, see steps/stages.py and steps/newton_systems.py
-    # the next fields, up to `solutions`, belong to the fixed-order form and are empty in other forms; N = n_q + n_c
+    # the next fields, up to `solutions`, belong to the fixed-order form; they are empty in other forms
     mass_values: Any  # nonzero entries of M, in the order of linalg/symbolic_factorization.py
     jacobian_values: Any  # nonzero entries of C_q, in the order of linalg/symbolic_factorization.py
     is_independent: Any  # (n_c) 1 for independent rows of C_q, 0 for redundant rows
     factors: Any  # entries of the factors of the augmented matrix, at the indices that f.ldl_program contains
-    pivot_sizes: Any  # (N) squared norms of rows, to which the pivots are compared, see linalg/sparse_ldl.py
-    unknowns: Any  # (N) right-hand side when a solver is called, solution when it returns
-    solutions: Any  # (3 N) scratch; then (n_c) for each row g of C_q, the factor s of the term s g^T g added to M, or 0
+    pivot_sizes: Any  # (n_q + n_c) squared norms of rows, to which the pivots are compared, see linalg/sparse_ldl.py
+    unknowns: Any  # (n_q + n_c) right-hand side when a solver is called, solution when it returns
+    solutions: Any  # (3 (n_q + n_c)) scratch; then (n_c) factor s for each row g of C_q if s g^T g is added to M, or 0
 
     sizes: Any = None  # the numbers that determine the sizes of all arrays, see `Sizes` in layout.py
     address: Any = 0  # address of `table`

@@ -64,7 +64,7 @@ FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN, REACTION_BY_Q_GIVEN, MASS_VALUES_GIVEN = (
     FAULT_KIND,  # index in Functions of a callback that returned NaN or infinity; -1: none known
     FAULT_TIME,  # time (s) at which this callback returned NaN or infinity
     GAMMA_REQUIRED,  # allowed error of Gamma by finite differences (evaluation/constraints.py), relative to GAMMA_SCALE
-    GAMMA_STEP_RATIO,  # time step of the differences for Gamma, relative to the result of `largest_difference_step`
+    GAMMA_STEP_RATIO,  # time step of finite differences for Gamma, relative to the result of `largest_difference_step`
     GAMMA_ACCURACY,  # error of Gamma, relative to GAMMA_SCALE, when GAMMA_STEP_RATIO was chosen last
     GAMMA_SCALE,  # size of Gamma, to which its errors are compared: largest |entry|, or sum of |terms| of G a, so far
     REUSE,  # after a correction of positions of at most this size, the Jacobian is not evaluated and factored again
@@ -115,7 +115,7 @@ FLAGS = _group("CONSTANT_MASS", "FIRST_GIVEN") | {f"{kind}_given": index for kin
     DEFECT_GAP,  # longest allowed time (s) between two evaluations in steps that evaluate their defect between nodes
     ATOL,  # index of the first absolute tolerance; there is one for each coordinate and its velocity
 ) = range(6)
-MAX_GAP_RATIO = 0.01  # longest time between two evaluations, tolerances[GAP], relative to the duration of the run
+MAX_GAP_RATIO = 0.01  # tolerances[GAP], the longest allowed time between two evaluations, over the duration of the run
 REPORTED_ERROR = 30.0  # near a singular position, velocity errors above this number of tolerances are reported
 
 WINDOW = 4  # number of states that a polynomial of dense output interpolates
