@@ -42,7 +42,7 @@ def digest_of(text: str, *sources: str | types.ModuleType) -> str:
     return digest.hexdigest()
 
 
-_DIGEST_TEXTS: WeakKeyDictionary[Dispatcher, str] = WeakKeyDictionary()  # see `register_digest`
+_DIGEST_TEXTS: WeakKeyDictionary[Dispatcher, str] = WeakKeyDictionary()  # texts hashed in place of callbacks
 
 
 def register_digest(callback: Dispatcher, text: str) -> None:

@@ -150,7 +150,7 @@ def _unbox(typ: Any, obj: Any, c: Any) -> NativeValue:
 
 
 def _load_word(context: Any, builder: Any, pointer: Any, offset: int, kind: Any) -> Any:
-    """Emit code that loads the 64-bit word `offset` of a table; LLVM may assume that it never changes."""
+    """Emit code that loads word number `offset` (64 bits) of a table; LLVM may assume that the word never changes."""
     slot = builder.gep(builder.bitcast(pointer, ir.IntType(64).as_pointer()), [ir.Constant(ir.IntType(64), offset)])
     word = builder.load(builder.bitcast(slot, kind.as_pointer()))
     word.set_metadata("invariant.load", builder.module.add_metadata([]))

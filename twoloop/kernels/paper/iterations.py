@@ -197,7 +197,7 @@ def iterate_first_order(f, w, options, t, h, q, v, a, A_stage, Q_stage, V_stage,
 
     The loop starts from an Euler step, and ends by the tests (32) and (33) of the paper. `a`: accelerations at (t, q,
     v). Row j of A_stage and row j of V_stage form K_j = [a_j; v_j]. An iteration updates one stage after another, each
-    with the latest K (Gauss-Seidel). (q1, v1) becomes the end of the step, on the constraints.
+    with the latest K (Gauss-Seidel). (q1, v1) becomes the end of the step, on the constraints; q_old, v_old: scratch.
     """
     s, A, _, b, _, c = tableau_of(options)
     n = q.size

@@ -3,7 +3,7 @@
 Order and step size are variable. The history consists of modified divided differences phi_i of the accelerations, as in
 Krogh's DVDQ and Shampine and Gordon's STEP, here for second-order equations: velocities are the integral of the
 polynomial through the accelerations, and positions are its double integral. The first evaluation is at the predicted
-state, which violates the constraints by the error of the prediction; the second is at the corrected state, projected
+state, which is off the constraints as far as the prediction is; the second is at the corrected state, projected
 onto the constraints. Differences of all coordinates are stored, so that a new partition needs no conversion.
 
 Notation: t_n are the times of accepted steps, psi_i(n) = t_n - t_{n-i}, psi_0 = 0, and i counts from 1 as in the
@@ -23,10 +23,10 @@ from twoloop.kernels.evaluation.inner_loop import evaluate_without_projection, p
 HIGHEST = 12  # largest order, as in Shampine and Gordon's STEP; the quadrature with NODES is exact up to order 13
 N_TERMS = HIGHEST + 2  # number of stored differences of accelerations, and of their coefficients for v and for q
 ERROR_FACTOR = 5.0  # factor on the error estimate, because the errors of many short steps add up
-SAFETY = 0.8  # safety factor: ratio of the next step size to the size for which the error would equal the tolerance
+SAFETY = 0.8  # safety factor: ratio of the next step size to the size for which the estimate would equal the tolerance
 GROWTH, SHRINKAGE = 1.2, 0.5  # largest ratio of successive step sizes, and smallest after a rejection
 START_GROWTH = 2.0  # largest ratio of successive step sizes while the order still rises with every step
-LEAST_FACTOR = 0.1  # smallest ratio of successive step sizes after a large error of predicted dependent positions
+LEAST_FACTOR = 0.1  # smallest ratio of successive step sizes if a predicted position is far from the constraints
 RESTART_AFTER = 3  # number of successive rejected steps after which the method restarts with order 1
 
 # eight Gauss nodes on [0, 1] and their weights: this quadrature is exact for polynomials up to degree 15
@@ -63,7 +63,7 @@ THETA, N_OPTIONS = range(2)
     NEXT_ORDER,  # order chosen at the end of an attempt for the next one
     N_SCALARS,
 ) = range(8)
-# indices of rows of coefficients, see the module's docstring: psi(n), psi(n+1), beta, g, G, and values of c_i at NODES
+# indices of rows: time spans psi(n) and psi(n+1), factors beta, coefficients g (for v) and G (for q), c_i at NODES
 PSI, NEW_PSI, BETA, G_VELOCITY, G_POSITION, C_AT_NODES, N_ROWS = range(7)
 
 
@@ -104,7 +104,7 @@ def _scratch_rows(memory, n):
 
 @kernel(COMMIT)
 def commit_adams(f, w, options, memory, tolerances, accepted):
-    """Add an accepted attempt to the history in `memory`, or count a rejected attempt."""
+    """Add an accepted attempt to the history in `memory`; after a rejected attempt, reduce the order or restart."""
     if not accepted:
         memory[FAILED] += 1.0
         memory[AGE] = 0.0
@@ -139,7 +139,7 @@ def _begin_history(memory, n, state):
 
 @merged
 def _compute_coefficients(memory, h, k):
-    """Store the coefficients psi(n+1), beta, g and G (see the module's docstring) for a step of size h at order k."""
+    """Store time spans psi(n+1), factors beta, coefficients g for v and G for q, for a step of size h at order k."""
     psi, new_psi, beta = _row(memory, PSI), _row(memory, NEW_PSI), _row(memory, BETA)
     g, G, c = _row(memory, G_VELOCITY), _row(memory, G_POSITION), _row(memory, C_AT_NODES)
     new_psi[0] = h

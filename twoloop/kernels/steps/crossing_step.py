@@ -12,7 +12,7 @@ motion, and the fixed-point iteration converges as it does elsewhere.
 - The end of the step is projected onto the constraints with a partition chosen there.
 - The generated code of the mechanism projects the stages. If there is no generated code, or if its pivots are too
   small, the general code projects them, with a partition chosen at the stage.
-- The step is rejected if the projection changes a stage by more than the tolerances: the stage is on another branch of
+- The step is rejected if the projection changes a stage by more than two tolerances: the stage is on another branch of
   the motion, or the polynomial is inaccurate.
 """
 
@@ -247,8 +247,8 @@ def _polynomial_at(time, duration, b, c, a, q_0, v_0, weights_v, weights_q, q, v
 def _finish_piece(f, w, t, min_node_pivot, options, tolerances, stage, state, new_state):
     """Store `stage`, a state [q, v, a], projected onto the constraints, in `new_state`; return an Attempt.
 
-    The state is not projected if its smallest pivot is below `min_node_pivot`, nor if its projection fails and
-    `min_node_pivot` is positive.
+    If `min_node_pivot` is positive, and the smallest pivot is below it or the projection fails, the state is stored
+    without projection.
     """
     n = w.Q.size
     q, q1, v1 = state[:n], new_state[:n], new_state[n : 2 * n]
@@ -342,7 +342,7 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
         if is_estimated and chooses_nodes and sweep == FEW_SWEEPS:
             min_node_pivot = min(DISTANCE_FACTOR * min_node_pivot, MAX_NEAR_RATIO)
         for i in range(S):
-            # nodes in both directions from the state `base`, first backwards in time
+            # order of nodes: from the state `base` backwards in time, then from `base` forwards
             j = n_before_base - 1 - i if i < n_before_base else i
             if sweep == 0:
                 if i == n_before_base:

@@ -215,7 +215,7 @@ def stages_at_once(options):
 
 @compiled
 def _update_derivatives(f, w, options, memory, t, h, Q, V, F):
-    """Compute derivatives of accelerations F at (t, Q, V) and Newton's factors if they are outdated; return a code."""
+    """Renew, if outdated, derivatives of accelerations (F at the state t, Q, V) and Newton's factors; return a code."""
     if f.force_by_q_given == 1 or memory[at.HAS_JACOBIAN] == 0.0:
         multipliers(f, w, t, Q, V, F, w.lam)
         memory[at.HAS_JACOBIAN] = 1.0

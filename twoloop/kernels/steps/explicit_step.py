@@ -3,7 +3,7 @@
 The method integrates the independent positions and velocities (q_i, v_i). The first stage is the state at the beginning
 of the step, and two embedded formulas estimate the error. By default, the inner loop computes the dependent coordinates
 of every stage, so that all stages satisfy the constraints. With FREE = 1, unlike in the paper, the method integrates
-dependent coordinates, too: stages violate the constraints by the error of the formula, and only the end of the step is
+dependent coordinates, too: stages violate the constraints as much as the formula does, and only the end of the step is
 projected. `f` is the kit, and `w` the workspace.
 """
 
@@ -93,7 +93,7 @@ def largest_error(tolerances, y, y1, fine_error, coarse_error, strict):
     e and d are the largest components of the error estimates `fine_error` and `coarse_error` (2 n, for positions and
     velocities), relative to atol + rtol |y|. The formula is not applied to each component separately: where d of a
     component passes through zero, the result would be e, which is of low order, and steps would need up to 30 % more
-    evaluations. If `strict`, the error is e^(3/2) / (e^2 + d^2)^(1/4), because terms of high order are not small near a
+    evaluations. If `strict`, return e^(3/2) / (e^2 + d^2)^(1/4) instead, as terms of high order are not small near a
     singular position.
     """
     n = fine_error.size // 2

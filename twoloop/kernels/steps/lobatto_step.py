@@ -48,7 +48,7 @@ from twoloop.kernels.linalg.dense import copy
     THETA,  # a projection has converged if its last correction is at most this, see `project`
     N_ITERATED,  # number of coordinates on which accelerations depend; only these coordinates are iterated
     N_ROWS,  # number of constraints
-    FREE,  # in steps longer than FREE * tolerances[DEFECT_GAP], the defect is also evaluated between the nodes
+    FREE,  # in steps longer than FREE * allowed time between evaluations, the defect is also evaluated between nodes
     MAY_REPEAT,  # 1: a sweep may evaluate accelerations twice; 0: once, because a second time would not be cheaper
     N_OPTIONS,
 ) = range(6)
@@ -74,7 +74,7 @@ LEAST_TREND = 0.4  # lower bound of `trend`, the ratio of the step sizes that th
 # step size that the convergence allows with two evaluations of accelerations in a sweep, relative to that with one
 GAIN_BY_REPEATS = 1.5
 # sweeps stop evaluating accelerations twice (REPEATS = 0) if the convergence allows steps this many times as long as
-# the error allows: the second evaluation then saves no time
+# the error estimate allows: the second evaluation then saves no time
 MAX_REACH = 2.5
 MAX_EXTRAPOLATION = 3.0  # the step size that the error estimate allows counts as at most this times the actual size
 _array_offsets = merged(array_offsets)
@@ -93,7 +93,7 @@ def _aligned_view(memory):
 
 @merged
 def _reuse_rejected_polynomial(f, data, state):
-    """Update `data` so that the polynomial of a step rejected for its error predicts the shorter repeated step."""
+    """Update `data` so that the polynomial of a rejected step predicts the shorter repeated step."""
     f.retry_nodes(data, state)
     if data[field.OLD_DEGREE] == 0.0:
         data[field.OLD_DEGREE] = max(data[field.DEGREE], 3.0)
@@ -239,7 +239,7 @@ def lobatto_step(f, w, options, memory, t, h, tolerances, state, new_state):
     if code == DONE:
         error = max(error, prediction_error(w, tolerances, h, state[:n], state[n : 2 * n], q1))
     if code == DONE and error <= 1.0 and w.nearly_singular == 1.0 and tolerances[ESTIMATE] == 1.0:
-        w.near_now = 2.0  # after the step, `check_partition` renews the partition and checks its pivots
+        w.near_now = 2.0  # 2: after the step, `check_partition` renews the partition and checks its pivots
         if _passes_singular_position(f, w, t, h, state, new_state):
             code = SINGULAR
     return Attempt(code, error, factor if error <= 1.0 else 0.0)

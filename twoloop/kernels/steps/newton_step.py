@@ -274,7 +274,7 @@ def newton_step(f, w, options, memory, t, h, tolerances, state, new_state):
         if memory[at.IS_FRESH] == 1.0 and (node == 0.0 or code != OUTER_DIVERGED):
             return Attempt(code, np.inf, 0.0)
         # repeat the step with new derivatives. If they are new already, the extrapolated state of the middle stage may
-        # be wrong, and with it derivatives there, as of friction: compute derivatives at the beginning of the step
+        # be wrong, and so may derivatives there, for example of friction: compute them at the beginning of the step
         if memory[at.IS_FRESH] == 1.0:
             node = 0.0
         memory[at.HAS_JACOBIAN] = 0.0

@@ -205,7 +205,7 @@ def reduce_to_independents(w, A, AT, B):
 
 @compiled
 def _fill_jacobians_from_tangents(f, w, memory, s, t, q, v):
-    """Store J_q and J_v, derivatives of accelerations at the last evaluated state, by tangents K, D; return a code."""
+    """Store J_q and J_v, derivatives of accelerations by q_i, v_i, at the last evaluated state; return a code."""
     n = q.size
     m = w.independent.size
     w.n_jacobians += 1
@@ -471,7 +471,7 @@ def _multiply_by_T(w, b, x, X):
 
 @compiled
 def _solve_and_keep_independents(w, b, numbers, pivots, substitute, x):
-    """Solve the bordered system for x (n_q); move independent entries to x[:n_dof]; other entries become scratch."""
+    """Solve the bordered system for x (n_q), using the factors `numbers`; move independent entries to x[:n_dof]."""
     Cq, _, _ = _border_views(w, x.size, w.rows.size, b)
     solve_bordered(w, b, Cq, numbers, pivots, substitute, x)
     for k in range(w.independent.size):  # in ascending order, no entry is overwritten before it is read
@@ -608,7 +608,7 @@ def _fill_tangent_entries_by_differences(f, w, t, q, v, by_v, base, residual, mo
 
 @compiled
 def _has_complete_pattern(f, base, residual, base_point, moved, largest, entries, predicted):
-    """Return True if the `entries` of K or D explain the difference between the residuals `base` and `residual` (n_q).
+    """Return True if K or D, with the `entries`, times the displacement agrees with the difference of the residuals.
 
     `base`, `residual`: residuals at `base_point` (q or v), and at `moved`. `largest`: largest term of a residual.
     `residual` and `predicted` (n_q) are overwritten.

@@ -14,8 +14,8 @@ from twoloop.kernels.data.common import ATTEMPT, Attempt, Step, allowed_error, c
 from twoloop.kernels.data.indices import NOT_LOADED
 
 MAX_STEP_RATIO = 3.0  # a step predicts the stages of the next step if the next step is at most this many times as long
-# Richardson's error estimate misses a force that jumps near an end of a step. So the error of a step is the larger of
-# Richardson's estimate and this factor times `estimate_end_error`
+# Richardson's estimate misses a force that jumps near an end of a step. So the estimate for a step is the larger of
+# Richardson's estimate and END_ERROR_WEIGHT * `estimate_end_error`
 END_ERROR_WEIGHT = 0.01
 
 # indices of the scalars in `options` of a method with s stages and the Butcher tableau A, b, c. After the scalars,
@@ -102,7 +102,7 @@ def estimate_end_error(tolerances, options, h, state, new_state, A_stage):
     """Estimate the error of a step, in units of the tolerances (eq. 26), from the stage accelerations A_stage (s, n).
 
     Let w be the range of the stage accelerations. Let e be the largest difference, at the ends of the step, between the
-    polynomial through the stage accelerations and the accelerations. If each term of the polynomial is f times the
+    polynomial through the stage accelerations and the true accelerations. If each term of the polynomial is f times the
     previous term, then e = w f^(s - 1), and the error of the method is about h w f^(order - 1): this is the estimate.
     If the force jumps, even between an end of the step and the nearest stage, e is as large as w, and the estimate is
     h w: steps then shrink until the jump no longer matters. Methods need a second estimate, too: e may be zero by
@@ -140,7 +140,7 @@ def estimate_end_error(tolerances, options, h, state, new_state, A_stage):
     N_REAL,  # number of real eigenvalues of the matrix A of the Butcher tableau
     N_PAIRS,  # number of pairs of conjugate complex eigenvalues of the matrix A of the Butcher tableau
     GAMMA0,  # first real eigenvalue of the tableau's A; if there is none, smallest magnitude of an eigenvalue
-    TESTS_VELOCITIES,  # 1: the error test compares velocity errors with tolerances; 0: it uses `velocity_error` instead
+    TESTS_VELOCITIES,  # 1: estimated velocity errors must be within tolerances; 0: results of `velocity_error` must be
     N_EIGEN_SCALARS,
 ) = range(5)
 

@@ -60,8 +60,8 @@ SUM_INDICES = N_SUMS  # index of one more array of such a list: for each express
 # operations; lists of expressions for the rows of G v + (C_t, b) = 0, and of Q - G^T lam - M a = 0
 EARLY, LATE, ROWS = 0, N_TABLE, 2 * N_TABLE
 BALANCE, N_ARRAYS = ROWS + N_SUMS + 1, ROWS + 2 * (N_SUMS + 1)
-# columns of GROUPS: kind of operation; then first and end index of the group's operations, of the further terms of
-# their first arguments, and of the further terms of their second arguments
+# columns of GROUPS: kind of operation; then begin and end (indices) of the group's operations, of all terms of their
+# first arguments except the first term of each, and of those of their second arguments
 KIND, BEGIN, END, MORE_FIRST, _, MORE_SECOND, _, N_GROUP = range(8)
 
 # indices of the scalars in `memory`. Two series of q (ORDER + 1, n_q each) and the arrays of `array_views` follow.

@@ -32,7 +32,7 @@ OUTDATED_CHANGE = 0.3  # the Jacobian J counts as outdated if its relative chang
 
 @compiled
 def filtered_velocity_error(w, memory, tolerances, z, unfiltered, filtered_once, filtered_twice, state, new_state, a1):
-    """Return the largest effect of a velocity error, in units of the tolerances, see `velocity_error`.
+    """Return the largest effect of an estimated velocity error, in units of the tolerances, see `velocity_error`.
 
     `unfiltered` (n_dof) is the velocity error. `filtered_once` and `filtered_twice` (n_dof) are this error multiplied
     once and twice by the filter (I - z J)^-1; z is the step size times a coefficient of the method, J the Jacobian.
@@ -107,10 +107,10 @@ def _derivatives_may_matter(w, memory, tolerances, z, unfiltered, max_duration, 
 def derivatives_agree(f, w, options, memory, s, t, z, tolerances, unfiltered, e_q, e_v, state, new_state, a_end):
     """Return True if the stored Jacobian J agrees with the equations at the end of a step, or cannot matter.
 
-    t: time at this end. z: step size times a coefficient of the method. (e_q, e_v) is (I - z J)^-1 times an error whose
-    velocity part is `unfiltered` (n_dof each). So the velocity part of J (e_q, e_v) is (e_v - unfiltered) / z. It is
-    compared with the difference between the accelerations at the end of the step and at a state displaced from this end
-    by a multiple of (e_q, e_v).
+    t, a_end: time, accelerations at this end. z: step size times a number. (e_q, e_v) is (I - z J)^-1 times an estimate
+    whose velocity part is `unfiltered` (n_dof each). So the velocity part of J (e_q, e_v) is (e_v - unfiltered) / z. It
+    is compared with the difference between the accelerations at the end of the step and at a state displaced from this
+    end by a multiple of (e_q, e_v).
     """
     n = w.Q.size
     max_duration = max(motion_time(w, tolerances, state, state[2 * n :]), motion_time(w, tolerances, state, a_end))
