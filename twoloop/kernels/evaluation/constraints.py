@@ -85,7 +85,7 @@ def gather_independent_columns(G, rate, rows, independent, D):
 # `largest_difference_step` is at most MAX_DIFFERENCE_STEP (s) and, in fast motion, at least MIN_STEP_RATIO times this
 MAX_DIFFERENCE_STEP, MIN_STEP_RATIO = 2e-4, 1e-4
 N_DIFFERENCE_STEPS = 12  # number of time steps that `_choose_difference_step` tries, each a quarter of the previous one
-ROUNDING_DISAGREEMENT = 1e-9  # Gamma with time steps e and 2 e may differ by this part of its size, due to rounding
+ROUNDING_DISAGREEMENT = 1e-9  # differences of Gamma with steps e and 2 e up to this part of its size count as rounding
 # if Gamma with time steps e and 2 e differs by less than this part of its size, e is doubled to reduce rounding errors
 NEGLIGIBLE_DISAGREEMENT = 1e-11
 # weights of values at the times 0, e, 2 e and 4 e in one-sided differences of order 2; COARSE: with the step 2 e
@@ -213,7 +213,7 @@ def gamma_by_differences(f, w, t, q, v, first, last):
 
     Gamma = -d/de [G v + (C_t, b)](t + e, q + e v) at e = 0, where v is constant.
 
-    Errors are relative to w.gamma_scale, the size of Gamma so far. The time step e is w.gamma_step_ratio times
+    Errors are relative to w.gamma_scale, the largest Gamma so far. The time step e is w.gamma_step_ratio times
     `largest_difference_step`. If Gamma with e and 2 e differ too much, as with kilohertz drives, choose a new ratio.
     """
     largest_step = largest_difference_step(q, v)

@@ -199,7 +199,7 @@ def _find_corrections(f, w, v):
 def project_state(f, w, t, q, v, theta, a, lam):
     """Project (q, v) onto the constraints; store accelerations `a` and multipliers lam; return DONE or a failure code.
 
-    q and v change in place. Corrections of q satisfy A x = 0, where A are the rows of the non-holonomic constraints.
+    q and v change in place. Corrections x of q satisfy A x = 0, where A are the rows of non-holonomic constraints.
 
     Passes end after one that corrects positions by at most theta, and velocities by at most theta max(1, max|v|). They
     also end after one that corrects positions by at most theta times w.pivot, the smallest pivot of C_q. Velocities are

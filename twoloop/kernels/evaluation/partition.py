@@ -323,7 +323,7 @@ def choose_oriented_partition(f, w, t, q):
 
 @compiled
 def _largest_coefficient(w):
-    """Return the largest |coefficient| if redundant rows are combinations of independent ones (row maxima: 1)."""
+    """Return the largest |coefficient| in combinations of independent rows that equal redundant rows; row maxima: 1."""
     rows = rows_of(w.index_v)
     largest = 0.0
     begin = 0

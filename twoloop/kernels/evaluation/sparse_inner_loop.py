@@ -258,7 +258,7 @@ def choose_rows(f, w, t, q):
 
 REGULARIZATION = 1e-11  # diagonal entry j of W (module docstring), relative to the sum of squares of column j of C_q
 CONVERGED_RESIDUAL = 1e-14  # multipliers are refined until reactions agree with the given ones up to this fraction
-MAX_RESIDUAL = 1e-9  # if refinement stops earlier, multipliers are accepted if reactions agree up to this fraction
+MAX_RESIDUAL = 1e-9  # if refinements help no more, multipliers are accepted if reactions agree up to this fraction
 MAX_SOLUTIONS = 30  # largest number of refinements of the multipliers of least norm
 
 
