@@ -118,7 +118,7 @@ def end_steps(code, settings, control, work, predicted_v):
     """Project NEW, the state at the end of the step, onto the constraints; include the changes in the error estimate.
 
     If a change of velocities, in tolerances, or PREDICTION_ERROR, for positions, is larger than ERROR, it replaces
-    ERROR: so a step is rejected if a drive jumps or bends between its stages. `predicted_v`: offset of scratch.
+    ERROR: so a step is rejected if a drive has a jump or kink between its stages. `predicted_v`: offset of scratch.
     """
     n, order = settings[at.N], settings[at.ORDER]
     state, new, predicted, _, _, _, _, _ = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])

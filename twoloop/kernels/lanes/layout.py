@@ -101,7 +101,7 @@ SHORTEST = 1e-13  # smallest step size, relative to max(|t|, |t1|); if a step is
 
 
 class LaneKit:
-    """Functions generated for a mechanism, and the step of a method; kernels receive this object by reference."""
+    """Hold the functions generated for a mechanism, and the step of a method; kernels receive a reference to this."""
 
     def __init__(self, own: GeneratedFunctions, step: Any = None):
         self.__dict__.update(dict.fromkeys(ALL_TASKS, 0))
@@ -296,8 +296,7 @@ def factor_matrices(work, matrix, pivots, n, imaginary):
 def solve_systems(work, matrix, pivots, n, imaginary, x):
     """Replace a right-hand side x (n) in each lane by the solution, using the factors from `factor_matrices`.
 
-    If `imaginary` > 0, the system is complex. Imaginary parts follow the real parts: of the matrix, `imaginary`
-    vectors behind; of x, n vectors behind.
+    If `imaginary` > 0, the system is complex. Imaginary parts: `imaginary` (matrix) or n vectors (x) after real parts.
     """
     imaginary_x = n if imaginary > 0 else 0
     for c in range(n):

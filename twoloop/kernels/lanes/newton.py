@@ -295,7 +295,7 @@ def _correct_stages(settings, method_options, s, work):
 
 @merged
 def _raise_to_largest_value(work, target, begin, n):
-    """Raise the vector `target` to the largest |value| in the n vectors beginning at `begin`; NaN if a value is NaN."""
+    """In each lane, raise the number at `target` to the largest |value| in n vectors from `begin` on; NaN if one is."""
     for i in range(n * LANES):
         magnitude, index = abs(work[begin * LANES + i]), target * LANES + i % LANES
         if magnitude > work[index] or magnitude != magnitude:
@@ -392,7 +392,7 @@ def store_state_from_stages(settings, b, bA, work):
 
 @merged
 def _allowed_error(control, work, state, new, j, entry, k):
-    """Return atol + rtol * max(|before|, |after| the step) for an entry of the state that belongs to coordinate j."""
+    """Return atol + rtol * (largest |value| before or after the step) for an entry of the state; j: its coordinate."""
     magnitude = max(abs(work[(state + entry) * LANES + k]), abs(work[(new + entry) * LANES + k]))
     return control[at.ATOL + j] + control[at.RTOL] * magnitude
 

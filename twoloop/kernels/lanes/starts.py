@@ -520,9 +520,9 @@ def motion_residuals(f, sizes, t, rtol, atol, runs, parameters, states_q, states
 def constraint_residuals(f, sizes, t, min_speed, parameters, q, v, scratch, worst):
     """Store in worst[k] the largest relative residual of C = 0 and C_q v + C_t = 0 at the state (q[k], v[k]).
 
-    Residual i is divided by (sum of |entries| in row i of C_q) * max|q_j|; for velocities, by the same with max|v_j|,
-    but at least min_speed (for states at rest), plus |C_t|. parameters : (n_states, n_p); sizes : n, n_c and the index
-    in f.p of the first parameter; scratch : (n_c (n + 2),) overwritten.
+    C_i is divided by s_i max|q_j|, where s_i is the sum of |entries| in row i of C_q; the residual of velocities, by
+    s_i max(max|v_j|, min_speed) + |C_t|: min_speed is for states at rest. parameters : (n_states, n_p); sizes : n, n_c
+    and the index in f.p of the first parameter; scratch : (n_c (n + 2),) overwritten.
     """
     n, n_c, first = sizes[0], sizes[1], sizes[2]
     C, rate, G = scratch[:n_c], scratch[n_c : 2 * n_c], scratch[2 * n_c :].reshape((n_c, n))
