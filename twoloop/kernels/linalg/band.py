@@ -76,7 +76,7 @@ def banded_pays(n_q: int, n_c: int, bandwidth: int) -> bool:
 
 @merged
 def has_banded_mass(f):
-    """Return True if the mass matrix is factored as a banded matrix; if it is diagonal, divisions are faster."""
+    """Return True if the mass matrix is factored as a banded matrix; not if diagonal: divisions are faster then."""
     return f.bandwidth >= 0 and f.diagonal_mass == 0
 
 

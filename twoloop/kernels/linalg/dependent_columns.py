@@ -28,7 +28,7 @@ def scratch_sizes(n_rows: int, n: int) -> tuple[int, int]:
 
 @compiled
 def _find_constant_pivot(R, K, columns, row_active, row_sizes, column_sizes):
-    """Return n * row + column of the constant entry of R that causes the least fill-in as a pivot; -1: none exists."""
+    """Return n * row + column (R has n columns) of the constant entry with the least fill-in as a pivot; -1: none."""
     best, best_fill, best_size, (m, n) = -1, 0, 0, R.shape
     for i in range(m):
         if not row_active[i]:

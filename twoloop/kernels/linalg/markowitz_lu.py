@@ -66,7 +66,7 @@ def index_size(r: int) -> int:
 
 
 def values_size(r: int, may_be_dense: bool = True) -> int:
-    """Return the length of `values`, the factors of a matrix of r rows."""
+    """Return the length of `values`, the factors of a matrix of r rows; dense factors fit if `may_be_dense`."""
     return r * (r if may_be_dense else min(r, MAX_ENTRIES_PER_LINE)) + r
 
 
@@ -272,7 +272,7 @@ def _sort_row(columns, sources, size, position):
 
 @compiled
 def _sort_and_count(rows, counts, lists):
-    """Sort the entries of each row by the order of elimination; return the numbers of all entries and subtractions.
+    """Sort the entries of each row by the order of elimination; return how many entries and subtractions there are.
 
     Store in counts[ACTIVE_ROW_SIZE] the number of entries of each row of U, in the order of elimination.
     """

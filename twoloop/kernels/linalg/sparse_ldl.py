@@ -80,10 +80,10 @@ def fill_saddle_matrix(program, mass, jacobian, values, stiffness, scratch):
 def factor(program, is_independent, values, sizes, min_sine_square):
     """Replace the matrix in `values` by its factors, with 1/pivot on the diagonal; return the smallest squared sine.
 
-    It belongs to the angle between a row of G and the span of previous rows, and equals -pivot / (squared norm of the
-    row); the squared norms are stored in `sizes`. On entry, `is_independent` is 0 for rows that count as redundant. It
-    becomes 0 for rows whose squared sine is at most `min_sine_square`. Rows with 0 do not affect the result. If M is
-    not positive definite on the velocities that the rows allow, return NOT_DEFINITE.
+    The sine is that of the angle between a row of G and the span of previous rows. Its square is -pivot / (squared norm
+    of the row); the squared norms are stored in `sizes`. On entry, `is_independent` is 0 for rows that count as
+    redundant. It becomes 0 for rows whose squared sine is at most `min_sine_square`. Rows with 0 do not affect the
+    result. If M is not positive definite on the velocities that the rows allow, return NOT_DEFINITE.
     """
     (n_q, n) = program[N_COORDINATES], program[N_PIVOTS]
     order, runs = pivot_order_of(program), update_runs_of(program)

@@ -308,7 +308,7 @@ def program_in_order(
     begin = np.concatenate([[0], np.cumsum(sizes)])
     row_of = np.concatenate([np.zeros(0, np.int64), *rows_below])
     column_of = np.repeat(np.arange(n), sizes)
-    entry_keys = column_of * n + row_of  # one ascending number for each entry of L
+    entry_keys = column_of * n + row_of  # one number for each entry of L, in ascending order
 
     def slots_of(column: Integers, row: Integers) -> Integers:
         off_diagonal_slots = n + np.searchsorted(entry_keys, column * n + row)
