@@ -137,7 +137,7 @@ EXTRA_SWEEPS = 7  # a step is rejected if it takes this number of sweeps more th
 MAX_CONTRACTION = 0.8  # if the contraction is at least this in the fourth sweep or later, the step is rejected
 MIN_RHO, MAX_RHO = 1e-3, 0.9  # bounds to which a measured contraction is clipped
 FAST_START, SLOW_START = 0.04, 0.3  # a guessed first step size is kept if the contraction in sweep 2 is between these
-STAGNATION_RATIO = 0.5  # sweeps also end if changes, as small as rounding errors, shrink by no more than this factor
+STAGNATION_RATIO = 0.5  # sweeps also end if a change may be rounding, and is at least this fraction of the last change
 # in steps of fixed size, these replace KAPPA, MAX_ROUNDING and the largest number of sweeps
 KAPPA_OF_FIXED, ROUNDING_OF_FIXED, MAX_SWEEPS_OF_FIXED = 1e-16, 1e-9, 60.0
 SMALLEST_RATIO = 1e-30  # added to (error of the iteration) / KAPPA before its logarithm is taken: the error may be 0
@@ -158,8 +158,7 @@ class CollocationCode:
     The methods use several emitters: `emit` writes operations on vectors of LANES numbers, `num` on single numbers,
     `vec2` on vectors of two numbers, and `wide` on vectors whose numbers belong to successive coordinates.
 
-    shared : code of the equations; the functions use the same array of coefficients.
-
+    shared : code of the equations; the functions for collocation steps read the same array of coefficients.
     Fields:
     iterated_coordinates : coordinates on whose positions or velocities the accelerations depend.
     numbers : Coefficients (program.py) that the functions read from an array.
@@ -712,7 +711,7 @@ class CollocationCode:
     def _store_stages(
         self, emit: LaneEmitter, work: Value, state: Value, k: Value, i: Value, sums: Sequence[Value]
     ) -> Value:
-        """Write code that stores v and q of the k-th iterated coordinate, i; return v. `sums`: both integrals of a."""
+        """Write code that stores v and q of the k-th iterated coordinate, i; return v. `sums`: integrals of a."""
         num = Emitter(emit.builder)
         h = emit.broadcast(num.load(work, mem.H))
         index, begin = num.pointer(work, k * LANES), num.pointer(state, i)
@@ -752,7 +751,7 @@ class CollocationCode:
 
 
 class Collocation(NamedTuple):
-    """Compiled functions of a mechanism for collocation steps, with their coefficients."""
+    """Compiled functions of a mechanism for collocation steps, and the coefficients that they read."""
 
     functions: DeferredFunctions
     code: CollocationCode
@@ -760,7 +759,7 @@ class Collocation(NamedTuple):
 
 
 def compiled_collocation(generated: GeneratedCode) -> Collocation:
-    """Return the functions of a mechanism and their coefficients; the functions are compiled when first called."""
+    """Return the functions for collocation steps and their coefficients; functions are compiled when first called."""
     code = generated.shared
     collocation: Collocation = code.cache.remembered(("collocation", code.equations.choice), lambda: _compile(code))
     return collocation._replace(numbers=generated.evaluate(collocation.numbers))

@@ -9,7 +9,7 @@ elimination that begins with M. In SIMD lanes, this function is called for all l
 lanes keep their results, so that the result of a run does not depend on the runs in other lanes.
 
 **Long equations** are split into functions that call one another, each compiled once: the compile time of LLVM grows
-faster than the length of a block. Functions exchange values in memory, where most values of a long block are anyway.
+faster than the length of a block. Functions exchange values in memory; a long block needs memory for them, too.
 Accelerations and both projections call the same functions for the factors of the matrix and for the solution.
 """
 
@@ -242,7 +242,7 @@ class SplitFunctions:
         return all_valid
 
     def _lowering(self, emit: Emitter, graph: Graph, args: Sequence[Value], stored: Mapping[int, Location]) -> Lowering:
-        """Return a writer for a part of which `args` are the arguments: three inputs, coefficients, then others."""
+        """Return a Lowering that writes a part; `args`: its arguments: three inputs, coefficients, then others."""
         *inputs, emit.numbers = args[:4]
         if width_of(emit.double_type) > 1:
             emit.constants = emit.numbers  # type: ignore[attr-defined]  # the coefficients are the same in all lanes
@@ -251,7 +251,7 @@ class SplitFunctions:
         return lowering
 
     def _write_factors(self, emit: Emitter, *arguments: Value) -> Value:
-        """Write a part that stores factors and shared quantities in `arguments[4]`; return a flag: all are valid."""
+        """Write a part that stores factors, and quantities for other parts, in `arguments[4]`; return a flag: valid."""
         graph, solution, stored = self.equations.graph, self.solution, arguments[4]
         lowering = self._lowering(emit, graph, arguments, {})
         locations = {i: (stored, index) for i, index in solution.stored_indices.items()}
@@ -271,7 +271,7 @@ class SplitFunctions:
                 emit.store(value, array, j)
         return lowering.is_valid(program, results[0])
 
-    # methods that other classes call, too. `numbers`: pointer to coefficients; other arguments, except t: to vectors
+    # methods that other classes also call; arguments: emitter, time t, then pointers (`numbers`: to the coefficients)
 
     def accelerations(self, emit: Emitter, t: Value, q: Value, v: Value, numbers: Value, a: Value) -> Value:
         """Write code that stores the accelerations at (t, q, v) in `a`; return the flag whether they are valid."""
@@ -343,7 +343,7 @@ class SplitFunctions:
         return is_valid
 
     def _stack_arrays(self, emit: Emitter) -> list[Value]:
-        """Return pointers to new arrays on the stack: stored quantities; r; c; a change of v, or multipliers."""
+        """Return pointers to new arrays on the stack: stored quantities; right sides r, c; change of v or lam."""
         sizes = self.solution.n_stored, self.n, self.n_rows, max(self.n, self.n_rows)
         return [_stack_array(emit, size) for size in sizes]
 
@@ -441,7 +441,7 @@ class SharedCode:
 
 
 class GeneratedCode(NamedTuple):
-    """Compiled functions together with the coefficients of one system."""
+    """Compiled functions together with the coefficients in the equations of one system, which they read."""
 
     shared: SharedCode
     numbers: Array  # values of the coefficients that the code reads

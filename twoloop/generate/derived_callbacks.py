@@ -1,6 +1,6 @@
-"""Derive C_q, C_t and Gamma exactly from traced callbacks.
+"""Derive C_q, C_t and gamma exactly from traced callbacks.
 
-If the user gives no callback for C_q or Gamma, a program derived from the other callbacks replaces it. The callbacks
+If the user gives no callback for C_q or gamma, a program derived from the other callbacks replaces it. The callbacks
 that the user gives are compared with exact derivatives, which are more reliable than finite differences.
 """
 
@@ -59,7 +59,7 @@ class DerivedSystem(NamedTuple):
 
 
 def derive_callbacks(system: ConstrainedSystem, check: Check) -> tuple[ConstrainedSystem, tuple[CallbackTraces, ...]]:
-    """Return a system with programs in place of missing callbacks for C_q and Gamma, and the traces used for them.
+    """Return a system with programs in place of missing callbacks for C_q and gamma, and the traces used for them.
 
     If no callback is missing, or callbacks cannot be traced, return the system itself and an empty tuple. If callbacks
     cannot be traced, finite differences replace the missing ones. `check` raises Untraceable if the traces are wrong.
@@ -108,7 +108,7 @@ DISPLACEMENTS = (0.0, 1e-3, 0.03)
 
 
 def exact_derivatives(system: ConstrainedSystem, check: Check = accept_traces) -> CallbackTraces | None:
-    """Return the exact derivatives C_q, C_t and Gamma as traces, to be compared with callbacks.
+    """Return the exact derivatives C_q, C_t and gamma as traces, to be compared with callbacks.
 
     Return None if there are more than MAX_ENTRIES entries, callbacks cannot be traced, or `check` rejects the traces.
     """
@@ -131,7 +131,7 @@ def _trace_derivatives(system: ConstrainedSystem, cache: TraceCache) -> Callback
 
 
 def has_exact_derivatives(system: ConstrainedSystem, t: float, q: Array, v: Array) -> bool:
-    """Return True if callbacks for C_q, C_t and Gamma agree with exact derivatives at states near a start (t, q, v).
+    """Return True if callbacks for C_q, C_t and gamma agree with exact derivatives at states near a start (t, q, v).
 
     If they differ, or callbacks cannot be traced, return False. Raise ValueError if C depends on time, perhaps only far
     from the start, but there is no callback for C_t.

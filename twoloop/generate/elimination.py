@@ -3,7 +3,7 @@
 The matrix of
 
     [M  G^T] [a  ]   [Q    ]
-    [G  0  ] [lam] = [Gamma]
+    [G  0  ] [lam] = [gamma]
 
 with G = [C_q; A] (A: non-holonomic rows) is eliminated in an order that is chosen once; entries that are always zero
 are skipped. A row of G comes after the coordinates in which it has entries. So the pivots are those of the definite

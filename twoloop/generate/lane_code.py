@@ -51,7 +51,7 @@ from twoloop.problem.system import ConstrainedSystem
 # constants of Taylor steps, as in kernels/steps/taylor_step.py
 # if a step is rejected because PREDICTION_ERROR > 1, the next step size is such that this error becomes TARGET_ERROR
 TARGET_ERROR = 0.3
-MIN_FACTOR, SAFETY, MAX_FACTOR = 0.1, 0.9, 5.0  # ratio of successive step sizes: minimum, safety factor, maximum
+MIN_FACTOR, SAFETY, MAX_FACTOR = 0.1, 0.9, 5.0  # smallest ratio of successive step sizes, safety factor, largest ratio
 MAX_REJECTIONS = 10  # a run with more successive rejected steps than this is repeated outside the lanes
 FIRST_UNIT = 0.01  # unit of time of the first series of a run, relative to the duration t1 - t0 of the run
 # a projection has converged if a correction is at most ABSOLUTE_CORRECTION (unit of q) or RELATIVE_CORRECTION * max|q|
@@ -76,7 +76,11 @@ class LaneMemory(NamedTuple):
 
 
 class LaneSteps:
-    """Generator of the code of steps for n coordinates and n_rows multipliers; layout.py describes fields such as H."""
+    """Generator of the code of steps in SIMD lanes, for n coordinates and n_rows multipliers.
+
+    Arguments of methods: `emit` appends instructions to a function. `order` is the order of Taylor series. `control`
+    points to settings, `work` to vectors: kernels/lanes/layout.py describes their fields, with names in capitals.
+    """
 
     n_numbers: int  # number of coefficients that depend on parameters
 
@@ -317,7 +321,7 @@ SparseRows = list[dict[int, Value]]  # the nonzero entries of each row, by colum
 
 
 def orientation_change_mask(emit: LaneEmitter, before: SparseRows, after: SparseRows) -> Value:
-    """Return a mask of the lanes where det G1 G0^T <= 0: steps in these lanes may have passed a singular position.
+    """Write code for a mask, and return it: lanes where det G1 G0^T <= 0 may have passed a singular position.
 
     G0 (`before`) and G1 (`after`) are the rows of the constraints at both ends of the step. By the Cauchy-Binet
     formula, the determinant is the inner product of the vectors of maximal minors of G0 and G1. It is positive if these
@@ -377,7 +381,7 @@ class LaneStages:
         return [np.asarray(each).tobytes() for each in self.tableau]
 
     def write(self, emit: LaneEmitter, arguments: tuple[Value, Value, Value], memory: LaneMemory) -> None:
-        """Write code that stores NEW, the state X (s) after the step began, and ERROR, which is valid only if X = H."""
+        """Write code for NEW, the state X (s) after the step began, and ERROR; it is valid only if X = H."""
         A, b, c, fine_weights, coarse_weights = self.tableau
         _, control, work = arguments
         x, t = emit.load(work, lanes.X), emit.load(work, lanes.T)
@@ -417,7 +421,7 @@ class LaneStages:
 
 
 class _Coordinate:
-    """Coordinate j in a loop over coordinates: its state before the step, and its accelerations at `count` stages."""
+    """Coordinate j in a loop over coordinates: its state before the step, its accelerations at `count` stages."""
 
     def __init__(self, stages: LaneStages, emit: LaneEmitter, memory: LaneMemory, j: Value, count: int):
         n, self.emit, self.new, self.n = stages.n, emit, emit.pointer(memory.new, j), stages.n
@@ -467,7 +471,6 @@ class LaneCode(LaneSteps):
 
     series : True: generate code for Taylor steps, too.
     tableau : Butcher tableau of an explicit Runge-Kutta method: generate code for its stages. None: no such code.
-
     Raise Untraceable if the equations, or their series, cannot be generated; the message says why.
     """
 
@@ -681,11 +684,9 @@ class LaneConstraints(LaneSteps):
     """Generator of the code for C, C_t and the entries of C_q in SIMD lanes.
 
     system : a system without nonholonomic rows.
-
     Fields:
     pattern : sparsity pattern of C_q in one array: for each row, the index in this array where its columns begin; then
         the length of the array; then the columns of the entries, row by row.
-
     Raise Untraceable if the constraints cannot be generated; the message says why.
     """
 

@@ -184,7 +184,8 @@ class LaneSeries:
         self.late = self._make_operations(program.late, first_result + len(program.early.first.column))
         self.rows = self._row_expressions(program.rows, program.row_indices)
         self.balance = self._row_expressions(program.balance, program.balance_indices)
-        # result of `_shared_sums`; until then an empty dict: `_shared_sums` calls `_factors`, which reads this dict
+        # keys: products whose sums other recurrences compute; values: factors in these, see `_shared_sums`. `_factors`,
+        # which `_shared_sums` calls, reads this dict: so it is empty at first
         self._carried_sums: dict[int, tuple[int, int]] = {}
         self._carried_sums |= self._shared_sums()
         self.carried_pairs = sorted(set(self._carried_sums.values()))
@@ -263,7 +264,7 @@ class LaneSeries:
         return {result: pair for result, pair in pair_of.items() if pair is not None}
 
     def _factors(self, operation: Operation) -> list[tuple[int, int]]:
-        """Return, for each result, the indices of the factors X, Y whose sum of X[j] Y[k - j] its recurrence needs."""
+        """Return, for each result, indices of two factors X, Y: its recurrence needs sums of X[j] Y[k - j] over j."""
         kind, results, first, second = operation
         if results[0] in self._carried_sums:
             return []
@@ -280,7 +281,7 @@ class LaneSeries:
         return [(x, result_indices[1]), (x, result_indices[0])] if kind == SINE else [(x, result_indices[0])]
 
     def write_order_0(self, emit: LaneEmitter, inputs: Sequence[Value], scratch: Value) -> None:
-        """Write code that stores the row of order 0 in `scratch`, which has the factored matrix; `inputs`: t, q, v."""
+        """Write code that stores the row of order 0 in `scratch`, where the matrix already is; `inputs`: t, q, v."""
         for index in (*range(self.rhs_offset, self.divisor_offset), *range(self.carried_offset, self.row_0_offset)):
             emit.store(emit.constant(0.0), scratch, index)
         row = _Row(self, emit, emit.pointer(scratch, self.row_0_offset))
@@ -470,7 +471,7 @@ class LaneSeries:
 
 
 class _Row:
-    """Row of one order in memory: a coefficient of each factor; values that `store` wrote are not loaded again."""
+    """Row in memory: coefficients of one order, one of each factor; what `store` has written is not loaded again."""
 
     def __init__(self, code: LaneSeries, emit: LaneEmitter, base: Value):
         self.code, self.emit, self.base = code, emit, base
@@ -491,7 +492,7 @@ class _Row:
 class _PartialSums(NamedTuple):
     """Sums of X[j] Y[k - j] over 1 < j < k, and the rows needed to add the terms j = 1 and j = k, which are missing."""
 
-    sums: dict[tuple[tuple[int, int], bool], Value]  # keys: ((X, Y), is for order k + 1); X, Y: factor indices
+    sums: dict[tuple[tuple[int, int], bool], Value]  # keys: ((X, Y), whether for order k + 1); X, Y: indices
     first_row: Value  # pointer to the row of order 1, or to a row of zeros if k is 1
     row_1: Value  # pointer to the row of order 1
     row_before: _Row  # row of order k - 1

@@ -256,7 +256,7 @@ def write(
     emit: Callable[..., Any],
     emitter: Callable[..., Emitter] = Emitter,
 ) -> None:
-    """Add the function `name` to a module; `kind`: types of its result and arguments; `emit` writes its body."""
+    """Add the LLVM function `name` to a module; `kind`: types of result and arguments; `emit` writes its body."""
     builder = module.function(name, *kind)
     builder.ret(emit(emitter(builder), *builder.arguments))
 
@@ -400,7 +400,7 @@ class Lowering(Algebra[Value]):
         return [self.affine(expr) for expr in exprs]
 
     def is_valid(self, program: Program, values: Sequence[Value]) -> Value:
-        """Return a bit: 1 if the program's conditions hold, `values` are finite, and |angles| < LARGEST_ANGLE."""
+        """Write code for a flag, and return it: the conditions hold, `values` are finite, |angles| < LARGEST_ANGLE."""
         emit, builder, zero = self.emit, self.emit.builder, self.emit.constant(0.0)
         total = zero
         for value in values:  # values that are not finite make the sum NaN

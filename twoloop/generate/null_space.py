@@ -74,7 +74,7 @@ class Factors:
             self.blocks.append(Block(row_indices, inverse, rows_below))
 
     def _inverse(self, pivots: list[list[Affine]], own_pivots: list[Any]) -> list[list[Affine]]:
-        """Return the inverse of a pivot block; `own_pivots`: pivots of rows of G without other rows of G, or None."""
+        """Return the inverse of a pivot block; `own_pivots`: pivots if G had only this row; None: no condition."""
         diagonal = [None if pivot is None else pivot.as_term() for pivot in own_pivots]
         a = pivots[0][0]
         if diagonal[0] is None:
@@ -202,12 +202,11 @@ class ReductionFailed(Exception):
 
 
 class DependentCoordinates:
-    """Solution a = g + T a_i of G a = gamma for given accelerations a_i of independent coordinates, see the module.
+    """Solution a = g + T a_i of G a = gamma: all accelerations a, given those of independent coordinates, a_i.
 
     rows : the matrix G of all constraints, of full rank.
     blocks : rows and columns of the pivots, in the order of elimination. The columns are the dependent coordinates.
     max_added : largest number of operations that may be added to the graph.
-
     Fields:
     independent : indices of the independent coordinates.
     T : the matrix T: for each row, its nonzero entries; keys: indices of independent coordinates.

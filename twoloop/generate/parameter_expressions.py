@@ -27,7 +27,7 @@ CANCELLATION_LIMIT = 8.0 * 2.0**-52
 NUMBER_TYPES = (int, float, np.number)  # types of numbers; a Parameter is a float
 _UNARY_FUNCTIONS = ("sin", "cos", "tan", "sqrt", "exp", "log", "arctan", "sinh", "cosh", "tanh", "absolute")
 FUNCTIONS = {name: getattr(np, name) for name in (*_UNARY_FUNCTIONS, "hypot", "power")}
-OPERATORS: dict[str, Callable[..., Any]] = {  # names in NumPy; functions in terms of Python's operators
+OPERATORS: dict[str, Callable[..., Any]] = {  # keys: names in NumPy; values: functions by Python's operators
     "add": operator.add,
     "subtract": operator.sub,
     "multiply": operator.mul,

@@ -47,10 +47,10 @@ class Sums(NamedTuple):
 class OperationGroups:
     """Operations in groups, in the order of their computation; their results are consecutive quantities.
 
-    groups : one row for each group of operations of one kind that do not need each other: the kind, then begin and end
-        of three ranges: of the operations; of their further terms in `first`; of those in `second` (see `Sums`). A
-        group of sines includes the cosines of the same angles. The last group contains the products whose second factor
-        depends on accelerations, multipliers or velocities, which linear equations determine in each order.
+    groups : array with a row for each group: operations of one kind that do not need the results of each other. A row:
+        the kind, then begin and end of three ranges: of the operations; of their further terms in `first` (see `Sums`);
+        of their further terms in `second`. Sines are in a group with the cosines of the same angles. The last group is
+        products whose second factor depends on a, lam or v, which linear equations determine in each order.
     first, second : first and second argument of each operation.
     """
 

@@ -61,7 +61,7 @@ def find_short_forces(system: ConstrainedSystem, force_was_traced: bool) -> Shor
 
     If callbacks cannot be traced, `by_time` and `by_state` are True. Systems with more than MAX_COORDINATES coordinates
     are not traced; then `by_time` is True, and `by_state` is False. Callbacks that are called in Python may store their
-    arguments, so that symbols might reach later calls: they are traced only if `force_was_traced`.
+    arguments, so that symbols might reach later calls: they are traced only if the force was traced before.
     """
     if system.n_q > MAX_COORDINATES:
         return ShortForces(True, False)
@@ -111,7 +111,7 @@ def _make_analysis(system: ConstrainedSystem) -> Any:
 
 
 class DegreeAlgebra(Algebra[float]):
-    """Algebra of degrees: the value of a quantity is its degree as a polynomial in `inputs`; f(x) counts like x."""
+    """Algebra of degrees: the value of a quantity is its degree as a polynomial in `inputs`; f(x) has that of x."""
 
     functions: Mapping[int, Callable[[float], float]] = MappingProxyType(
         {

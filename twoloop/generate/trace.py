@@ -529,7 +529,7 @@ def derive_cached(
 
 
 def _derive_shared(system: ConstrainedSystem, cache: TraceCache, key: Any, make: Callable[[TraceCache], Any]) -> Any:
-    """Return what `make` derives from `cache`, specialized for `system`; if this fails, return the Untraceable."""
+    """Return what `make` derives from `cache`, specialized for `system`; if this fails, return the exception."""
     try:
         result = cache.remembered(key, partial(make, cache))
         return result.specialize(

@@ -43,7 +43,7 @@ ROUNDING_DIFFERENCE = 16.0 * np.finfo(float).eps
 CLEAR_DIFFERENCE = 1e-6
 # `_is_systematic` compares call and trace at N_NEIGHBOURS states; PERTURBATION: their largest relative distance
 PERTURBATION, N_NEIGHBOURS = 1e-7, 12
-MARGIN = 0.01  # a CheckedRegion is larger than the range of checked states by this fraction, shorter than most steps
+MARGIN = 0.01  # a CheckedRegion exceeds the range of checked states by this fraction of it; most steps are longer
 MARGIN_AT_REST = 1e-9  # this fraction of the largest range is added, for coordinates at rest, whose own range is 0
 
 
@@ -72,7 +72,7 @@ class CallbackTraces:
         self.program = OperationTable.from_results(graph, 1 + 2 * system.n_q, results)
 
     def specialize(self, system: ConstrainedSystem, evaluate: Evaluator) -> "CallbackTraces":
-        """Return a copy with the coefficients of another system; `evaluate` computes them from its parameters."""
+        """Return a copy for another system: coefficients of expressions are those that `evaluate` yields for it."""
         traced = self.replace_coefficients(evaluate)
         traced.name = system.name
         return traced
