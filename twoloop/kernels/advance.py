@@ -125,7 +125,7 @@ def _attempt_step(f, w, options, memory, tolerances, control, clock, t, size, cr
 
 @merged
 def _must_repeat_at_jump(f, w, tolerances, control, clock, t, size, accepted, state, new_state):
-    """Return True if a step (`accepted` or not) must be repeated because C_t or b jumps in it, or has a steep ramp.
+    """Return True if a step (`accepted` or not) must be repeated because C_t or b jumps or has a steep ramp in it.
 
     For a jump, store the interval that contains it in clock[JUMP_FROM] and clock[JUMP_TO]. For a ramp, store the next
     step size in clock[H_NEXT].
@@ -329,7 +329,7 @@ def advance(
         error *= error_factor
         if factor == 0.0:
             factor = step_size_ratio(control, clock, size, error)
-        elif error_factor > 1.0 and error > 0.0:  # the method computed `factor` without `error_factor`
+        elif error_factor > 1.0 and error > 0.0:  # limit `factor`, which the method computed without `error_factor`
             factor = min(factor, max(control[FACTOR_MIN], control[SAFETY] * error ** -control[EXPONENT]))
         proposed_size = min(size * factor, clock[at.H_LIMIT])
         if not accepted and factor > 1.0:

@@ -344,7 +344,7 @@ def _equals_last_start(last_start, t, t1, q, v):
 # - NOTHING_TO_CHECK: flag, Python need not check this run; IS_NEW: flag, the start differs from the previous one
 # - JUMPED: flag, velocities jumped in the last step (see MAX_CHANGE_RATIO); END_CODE: code that `advance` returned
 # - IN_CHECKED_REGION: flag, all states are in the region in which callbacks agreed with their traces
-# - DEFECT_KNOWN: flag, the defect was evaluated in every step; DEFECT: largest defect, over its tolerance
+# - DEFECT_KNOWN: flag, the defect was evaluated in every step; DEFECT: largest defect / its tolerance
 # - LONGEST_GAP: longest time (s) between two evaluations of the equations
 N_STATES, N_STEPS, NOTHING_TO_CHECK, JUMPED, IN_CHECKED_REGION, DEFECT_KNOWN = range(6)
 DEFECT, LONGEST_GAP, END_CODE, IS_NEW, N_REPORT = range(6, 11)

@@ -21,11 +21,11 @@ EPS = 2.0**-52  # spacing of floating-point numbers at 1
 MAX_GAP_RATIO = 8.0  # neighbouring steps count as equally long if the longest is at most this multiple of the shortest
 # v has a polynomial of its own if (rounding error of q) / (duration of the interval) exceeds this number of tolerances
 MAX_VELOCITY_ROUNDING = 10.0
-# a pivot here is the ratio of the smallest to the largest pivot, see min_pivot_ratio in partition.py. A position counts
-# as singular if its pivot is below SINGULAR_PIVOT, or this fraction of the larger pivot at the ends of the interval
+# "pivot ratio": smallest / largest pivot at a position, see min_pivot_ratio in partition.py. A position is singular if
+# its pivot ratio is below SINGULAR_PIVOT, or below SINGULAR_PIVOT_RATIO times the larger one at the interval's ends
 SINGULAR_PIVOT_RATIO = 0.01
 SINGULAR_PIVOT = 1e-5
-# a position with a pivot below WEAK_PIVOT also counts as singular if pivot * (change of v by the projection) is below
+# a position with a pivot ratio below WEAK_PIVOT is also singular if pivot ratio * (change of v by the projection) <
 # MAX_VIOLATION tolerances: this product estimates how much v violates the constraints, which is too little to matter
 MAX_VIOLATION, WEAK_PIVOT = 10.0, 0.05
 
@@ -107,7 +107,7 @@ def _kind_by_duration(kind, tolerances, h, states, i):
 
 @inlined
 def _fit_polynomials(tolerances, t, states, group, z_q, c_q, z_v, c_v):
-    """Store the polynomials of an interval: times z_q and coefficients c_q for q; z_v and c_v for v if it has its own.
+    """Store the polynomials of an interval: times z_q, coefficients c_q for q; z_v, c_v if v has its own polynomials.
 
     `group`: row of the table of intervals (data/indices.py). Return the kind and duration (s) of the interval; indices
     of the first and last interpolated state; number of values (with derivatives) per state; numbers of coefficients.

@@ -128,7 +128,7 @@ class Origin(NamedTuple):
     may_end_beyond: bool = False  # whether the polynomial may end beyond the end of the run
 
 
-# if an earlier state has less than this fraction of the base's distance, another singular position lies between the two
+# another singular position is between two states if the earlier one has less than this fraction of the other's distance
 MIN_DISTANCE_RATIO = 0.5
 
 
@@ -178,7 +178,7 @@ def cross_singularity(run: Run, past: list[TimedState]) -> tuple[Plan, Array]:
     base, run.mirrored_size = None, 0.0
     if not has_fixed_step:
         base, run.mirrored_size = _find_base_state(run, [(t, state) for t, state in past if t >= earliest])
-    # try several origins, because one may fail: its nodes may lie before a jump of a force; near the start or the end
+    # try polynomials with several origins: the nodes of one may lie before a jump of a force; near the start or the end
     # of the run, there may be too few nodes; a polynomial from an old base may be too long
     h_long, compiled = float(clock[a.H_LONG]), not run.system.called_in_python
     near_start = compiled and _is_near_start(run)

@@ -461,7 +461,7 @@ def _describe_near_end(run: "Run", t1: float) -> str:
 
 
 def _describe_near_singular(run: "Run", t1: float) -> str:
-    """If C_q is close to losing rank at the last state, return sentences on it; else ""."""
+    """If C_q is close to losing rank at the last state, return sentences on this position; else ""."""
     ratio = singular_ratio(run.system, float(run.clock[run.a.T]), run.state[: run.system.n_q], run.rank)
     if ratio > MAX_SINGULAR_RATIO:
         return ""

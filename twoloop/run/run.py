@@ -104,7 +104,7 @@ class Run:
         self._reset_clock(t0)
         self.write_step_control(plan)
         self.substituted = False  # whether `plan.substitute` has replaced the first plan
-        self.near_threshold = singular_threshold(rtol)  # near a singular position, smallest / largest pivot is below it
+        self.near_threshold = singular_threshold(rtol)  # below it, smallest / largest pivot shows a singular position
         force_traced = any("force" in each.kinds for each in plan.traced)
         short_and_steep = system.remembered(
             ("changes", force_traced),

@@ -94,7 +94,7 @@ def _least_ratio_between(
 def describe_velocity_jump(
     system: ConstrainedSystem, crossings: Crossings, end_state: TimedState, rank: int, rtol: float, atol: Array
 ) -> str:
-    """Return a message about the first singular position where velocities jumped, "" if they did nowhere.
+    """Return a message about the first singular position where velocities jumped; "" if there is none.
 
     A jump is a change larger than accelerations explain. Near such a position the tolerances do not distinguish the
     branches of the motion, and steps may have switched to another branch.

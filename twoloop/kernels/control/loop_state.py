@@ -44,8 +44,8 @@ H_BEFORE, ERROR_BEFORE, N_PAST = range(3)
     STORE_ALL,  # 1: the states after all accepted steps are stored; 0: only states at output times
     SYMMETRIC,  # 1: each step chooses a partition at its midpoint; 0: it is kept until `partition_is_poor` is True
     MAX_ATTEMPTS,  # number of attempted steps after which `advance` returns; its caller then checks progress and time
-    # 1: `advance` returns NEAR_SINGULAR near a singular position, so that the caller crosses it. 0: it never does so.
-    # SUSPENDED: it does not do so near the present singular position; far from it, the value becomes 1 again
+    # 1: near a singular position, `advance` returns NEAR_SINGULAR, and the caller crosses the position. 0: never.
+    # SUSPENDED: not near the present singular position; far from this position, the value becomes 1 again
     MAY_CROSS,
     SHORTEST,  # steps must be longer than this (s), and longer than EQUAL_SPACINGS spacings of floating-point times
     MAY_SWITCH,  # 1: `advance` returns SWITCH_METHOD if a value is not finite, or a step returns UNSUITED; 0: never

@@ -114,7 +114,7 @@ N_OPTIONS = N_PAIR + 2 * N_OF_EACH
     H_TRIED,  # size of the last attempted step (s)
     ERROR_TRIED,  # error of the last attempted step, in tolerances
     N_TRIALS,  # number of trials so far
-    N_ABOVE_LIMIT,  # number of estimates of h * rate above LIMIT; one below sets it to 0 unless trials cost too much
+    N_ABOVE_LIMIT,  # number of estimates of h * rate above LIMIT; one below LIMIT sets it to 0 if trials are cheap
     N_SCALARS,
 ) = range(19)
 
@@ -310,7 +310,7 @@ def _phase_to_begin(f, w, options, memory, tolerances, t, state, new_state):
     memory[T_BEGIN], memory[COST_BEGIN] = t, cost
     memory[NEXT_ESTIMATE] = w.n_evaluations + _evaluations_between_estimates(options, memory)
     memory[ESTIMATES_TO_WAIT] -= 1.0
-    h_rho = memory[H_MEAN] * memory[RATE] / options[LIMIT]  # step size * (largest rate), over its stability limit
+    h_rho = memory[H_MEAN] * memory[RATE] / options[LIMIT]  # step size * (largest rate) / stability limit
     if h_rho > 1.0:
         memory[N_ABOVE_LIMIT] += 1.0
     if memory[ESTIMATES_TO_WAIT] > 0.0:
@@ -338,7 +338,7 @@ def _phase_to_begin(f, w, options, memory, tolerances, t, state, new_state):
         or is_costly
         or (memory[N_ABOVE_LIMIT] >= options[N_ESTIMATES] and is_cheap)
     )
-    if is_cheap and h_rho <= 1.0:  # if trials cost too much, N_ABOVE_LIMIT is kept: one begins later
+    if is_cheap and h_rho <= 1.0:  # N_ABOVE_LIMIT is kept if trials cost too much: a trial begins later
         memory[N_ABOVE_LIMIT] = 0.0
     is_expensive = cost_per_second > MIN_GAIN * memory[COST_PER_SECOND]  # the explicit method cost less
     if (memory[PHASE] == EXPLICIT and is_due) or (memory[PHASE] == IMPLICIT and (h_rho < RETURN_BELOW or is_expensive)):

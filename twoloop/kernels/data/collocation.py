@@ -41,14 +41,14 @@ CONVERGED, REJECTED, GUESSED, NOT_COMPUTED = range(4)
     FACTOR_OF_ERROR,  # largest ratio of the next step size to this one that the error allows
     FACTOR_OF_DEFECT,  # largest ratio of the next step size to this one that the defect allows
     ALLOWED_H,  # largest size (s) with which the last step would have satisfied the error test
-    SIZE,  # largest |v| + H |a| (H: step size) at its beginning, relative to the tolerances: scale of rounding errors
-    STRICTER,  # largest weight of all coordinates (see WEIGHTS), divided by the largest one of an iterated coordinate
+    SIZE,  # largest |v| + H |a| (H: step size) where the step begins, relative to tolerances: scale of rounding errors
+    STRICTER,  # largest of all WEIGHTS / largest weight of a coordinate on which accelerations depend (or its velocity)
     REPEATS,  # 1: each sweep (iteration) evaluates accelerations at old, then again at new velocities; 0: only once
 ) = range(29)
 # offsets of arrays that follow the single numbers
 POWERS = 32  # offset of eight numbers: powers 1 to 8 of H / H_BEFORE (sizes of this step and of the one before)
 SCALED = 40  # offset of eight numbers: coefficients of the polynomial that predicts an acceleration, times POWERS
-MOVED = 48  # offset of eight numbers, one for each projected end of a step: max|correction of q| in its last iteration
+MOVED = 48  # offset of eight numbers, one for each projected end of a step: max|correction of q| in the last iteration
 VALID = 56  # offset of eight numbers, one for each end of a step: 1 if its projection converged, else 0
 DEFECTS = 64  # offset of eight numbers: values of DEFECT in successive steps
 WEIGHTS = 72  # offset of n_q numbers: weights, 1 / (allowed error of the velocity) for each coordinate

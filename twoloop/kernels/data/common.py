@@ -414,7 +414,7 @@ def allowed_error(tolerances, m, x, x1):
 
 @merged
 def is_beyond_gap(tolerances, h):
-    """Return whether a step of size h is longer than tolerances[GAP], the longest time between evaluations."""
+    """Return whether a step of size h is longer than tolerances[GAP], the longest allowed time between evaluations."""
     return h > tolerances[GAP] * (1.0 + GAP_SLACK)
 
 

@@ -115,7 +115,7 @@ FLAGS = _group("CONSTANT_MASS", "FIRST_GIVEN") | {f"{kind}_given": index for kin
     DEFECT_GAP,  # longest allowed time (s) between two evaluations in steps that evaluate their defect between nodes
     ATOL,  # index of the first absolute tolerance; there is one for each coordinate and its velocity
 ) = range(6)
-MAX_GAP_RATIO = 0.01  # tolerances[GAP], the longest allowed time between two evaluations, over the duration of the run
+MAX_GAP_RATIO = 0.01  # tolerances[GAP] (longest allowed time between two evaluations) / duration of the run
 REPORTED_ERROR = 30.0  # near a singular position, velocity errors above this number of tolerances are reported
 
 WINDOW = 4  # number of states that a polynomial of dense output interpolates
