@@ -99,7 +99,7 @@ def trusted_folder(folder: Path) -> Path:
 
 def reason_to_distrust(folder: Path) -> str:
     """Return the reason why another user could have written to a folder or a folder above it; "" if nobody could."""
-    if os.name != "posix":  # on other systems, the mode does not contain the access rights
+    if os.name != "posix":  # then the mode does not contain the access rights
         return ""
     real_path = Path(os.path.realpath(folder))
     for each in [real_path, *real_path.parents]:

@@ -346,7 +346,7 @@ class FunctionCopier:
         self.copies: dict[Any, Any] = {}
 
     def replacement_of(self, value: Any, names: frozenset[str] = frozenset()) -> Any:
-        """Replace a helper, the items of a tuple, or the attributes `names` of a module; return any other value."""
+        """Return a copy of a helper, tuple (items copied) or module (attributes `names` copied); else `value`."""
         if self.is_copied(value):
             if id(value) not in self.copies:
                 self._add_copy(value)

@@ -3,8 +3,8 @@
 Order and step size are variable. The history consists of modified divided differences phi_i of the accelerations, as in
 Krogh's DVDQ and Shampine and Gordon's STEP, here for second-order equations: velocities are the integral of the
 polynomial through the accelerations, and positions are its double integral. The first evaluation is at the predicted
-state, which is off the constraints as far as the prediction is; the second is at the corrected state, projected
-onto the constraints. Differences of all coordinates are stored, so that a new partition needs no conversion.
+state, which is near the constraints, but not on them; the second is at the corrected state, projected onto the
+constraints. Differences of all coordinates are stored, so that a new partition needs no conversion.
 
 Notation: t_n are the times of accepted steps, psi_i(n) = t_n - t_{n-i}, psi_0 = 0, and i counts from 1 as in the
 literature; beta_i = prod_{j<i} psi_j(n+1) / psi_j(n). In the step, for s from 0 to 1, the polynomial through the last k
@@ -173,7 +173,7 @@ def _predict_state(memory, h, k, old, new, state, q1, v1, n):
     mean_v, mean_q = _scratch_rows(memory, n)
     for m in range(0, old.shape[1], 4):
         d0, d1, d2, d3 = old[N_TERMS, m], old[N_TERMS, m + 1], old[N_TERMS, m + 2], old[N_TERMS, m + 3]
-        # old[k] + d0 is a difference, see `_difference_table`; row k + 1 of `new` serves the estimate at order k + 1
+        # old[k] + d0 is a difference, see `_difference_table`; row k + 1 of `new` is for the estimate at order k + 1
         b = beta[k]
         new[k + 1, m] = -b * (old[k, m] + d0)
         new[k + 1, m + 1] = -b * (old[k, m + 1] + d1)

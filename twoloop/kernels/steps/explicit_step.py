@@ -3,8 +3,8 @@
 The method integrates the independent positions and velocities (q_i, v_i). The first stage is the state at the beginning
 of the step, and two embedded formulas estimate the error. By default, the inner loop computes the dependent coordinates
 of every stage, so that all stages satisfy the constraints. With FREE = 1, unlike in the paper, the method integrates
-dependent coordinates, too: stages violate the constraints as much as the formula does, and only the end of the step is
-projected. `f` is the kit, and `w` the workspace.
+dependent coordinates, too: stages violate the constraints slightly, and only the end of the step is projected. `f`
+is the kit, and `w` the workspace.
 """
 
 import numpy as np

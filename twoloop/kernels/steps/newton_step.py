@@ -94,7 +94,7 @@ def _solve_stages(f, w, options, memory, t, h, tolerances, q, v, A_stage):
         correct_stages(f, w, options, memory, s, residual, A_stage)
         largest_q, largest_v = 0.0, 0.0
         for j in range(s):
-            change_q, change_v = Q_stage[j], V_stage[j]  # reused as scratch
+            change_q, change_v = Q_stage[j], V_stage[j]  # the stages are no longer needed: scratch
             for m in range(n):
                 change_q[m] = 0.0
                 change_v[m] = 0.0

@@ -402,7 +402,7 @@ def _fill_bands_from_callbacks(f, w, memory, s, t, q, v, b):
 
 @compiled
 def _fill_banded_tangents(f, w, memory, s, t, q, v):
-    """Store the bands of K and D (derivatives of forces) at the last evaluated state, C_q and w.D; return a code."""
+    """Store bands of K and D (derivatives of forces) at the last evaluated state, and copy C_q, w.D; return a code."""
     n = q.size
     b = f.bandwidth
     w.n_jacobians += 1

@@ -55,7 +55,7 @@ from twoloop.kernels.linalg.saddle_point import solve_with_multipliers
 GROUPS, FIRST, SECOND, N_TABLE = 0, 1, 7, 13
 # indices of the arrays of a list of affine expressions, see Sums in twoloop.generate.series
 COLUMN, COEFFICIENT, CONSTANT, ROW, MORE_COLUMN, MORE_COEFFICIENT, N_SUMS = range(7)
-SUM_INDICES = N_SUMS  # index of one more array of such a list: for each expression, the index where its value is stored
+SUM_INDICES = N_SUMS  # index of a further array of such a list (of affine expressions): where their values are stored
 # indices, among the arrays of the series program, of the first arrays of its four parts: tables of early and of late
 # operations; lists of expressions for the rows of G v + (C_t, b) = 0, and of Q - G^T lam - M a = 0
 EARLY, LATE, ROWS = 0, N_TABLE, 2 * N_TABLE
