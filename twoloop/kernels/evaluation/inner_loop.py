@@ -340,7 +340,7 @@ def project(f, w, t, q, v, theta, a, lam):
 
 @merged
 def restore_constraints(f, w, t, q, v, tolerance):
-    """Compute dependent from independent entries of q and v; `tolerance`: of corrections of q; return a code."""
+    """Compute dependent from independent entries of q and v; `tolerance`: limit of corrections of q; return a code."""
     return f.inner(f, w, tasks.RESTORE, t, q, v, tolerance, w.x, w.lam)
 
 

@@ -204,7 +204,7 @@ def _count_independent(is_independent):
 def _choose_rows(f, w, t, q):
     """Set w.is_independent to 1 for independent rows of G, else to 0; factor [M G^T; G 0] with these; return a code.
 
-    Rows with small pivots are left out at first, then added one by one if they are independent of the chosen rows.
+    Rows with pivots up to SUSPECT_PIVOT are left out first, then added one by one if independent of the chosen rows.
     """
     w.is_independent[:] = 1.0
     if not _factor_entries(f, w, SUSPECT_PIVOT) > 0.0:

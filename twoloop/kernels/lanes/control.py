@@ -22,7 +22,7 @@ from twoloop.kernels.lanes.layout import (
 )
 
 # indices in `options`, after N_RULE numbers of the step-size rule; the options of the method, as outside lanes, follow
-# - JUMP_RATIO: largest ratio of true error to error estimate in a step in which a force jumps
+# - JUMP_RATIO: assumed largest ratio of true error to error estimate in a step in which a force jumps
 # - FIRST: first step size, relative to the shortest time scale at the start; LEAST: smallest tolerance of a coordinate
 JUMP_RATIO, FIRST, LEAST, N_HEAD = range(N_RULE, N_RULE + 4)
 

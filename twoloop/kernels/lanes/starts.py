@@ -55,7 +55,7 @@ def subtract_products(work, target, x, x_stride, y, y_stride, count):
 def subtract_row_product(work, target, entries, pattern, i, y):
     """In each lane, subtract the dot product of row i of a sparse matrix and the vector at offset y from `target`.
 
-    `entries`: offset of the nonzero entries of the matrix, row by row; `pattern`: their columns, see module docstring.
+    `entries`: offset of the nonzero entries, row by row; their columns in row i are pattern[pattern[i]:pattern[i + 1]].
     """
     for e in range(pattern[i], pattern[i + 1]):
         subtract_products(work, target, entries + e - pattern[0], 1, y + pattern[e], 1, 1)
@@ -72,7 +72,7 @@ def _multiply_vector(work, target, factor):
 def _cholesky(work, pattern, n_rows, n_redundant, row, factors, shift):
     """Store the Cholesky factor of G G^T + shift I + Z^T Z in each lane, with inverted diagonal entries.
 
-    G, Z and the result are parts of `factors`, see `factor_gram`. `row` (n) is scratch: zero on entry and on return.
+    G, Z (combinations of rows of G that vanish) and the result are in `factors`. `row` (n): zero on entry and return.
     """
     n_entries = pattern[n_rows] - pattern[0]
     gram = factors + n_entries + n_rows

@@ -166,7 +166,7 @@ def _scratch_view(numbers, n, n_c, b):
 
 @compiled
 def factor_bordered(w, b, Cq, numbers, pivots, factorize, substitute):
-    """Factor [[B, Cq^T], [Cq, 0]], with B in `numbers`, by LAPACK routines such as DGBTRF, DGBTRS; return a code."""
+    """Factor [[B, Cq^T], [Cq, 0]], B in `numbers`, by `factorize`, `substitute` (as DGBTRF, DGBTRS); return a code."""
     n_c, n = Cq.shape
     band = lu_band(numbers, n, b)
     exchanges = pivots[: n - n_c].view(np.int32)
