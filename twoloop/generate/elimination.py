@@ -79,10 +79,10 @@ class PivotChoice:
     """Choice of rows and pivots for the elimination, made by the numbers of M and G at one position.
 
     rows : indices of the independent rows of G; the other rows are redundant.
-    added_rows, scales : M may be singular; then M + sum_k scales[k] g^T g, where g is row added_rows[k] of G, replaces
-        M. This sum is definite. Scales are powers of two, with which the added terms are about as large as M.
-    min_pivot : smallest pivot of a row of G with which results count as valid, relative to the pivot that the row has
-        without the other rows; a power of ten.
+    added_rows, scales : if M is singular or has little inertia about joints, M + sum_k scales[k] g^T g replaces M; g is
+        row added_rows[k] of G. The sum is definite. Scales are powers of two; added terms are about as large as M.
+    min_pivot : results are valid if the pivot of each row of G, divided by the pivot that it would have without the
+        other rows, is at least min_pivot, a power of ten.
     blocks : pivot blocks in the order of elimination. A block consists of one or two rows (indices in `rows`), and as
         many dependent coordinates, for which these rows are solved. Empty: no dependent coordinates are eliminated.
     is_refined : whether solutions are improved by one step of refinement, because small pivots may cost digits.
@@ -284,7 +284,7 @@ def _hides_little_inertia(choice: PivotChoice, mass: Array, G: Array) -> bool:
 
 MAX_OPERATIONS = 60_000  # more operations of callbacks and elimination are refused; 40 bodies in space need fewer
 # `reduced_program` is compiled in addition if it costs at most this fraction of `mass_first_program`, which is needed
-# anyway where pivots are small. At a relative cost of 0.68 (four-bar), it saves 5 % of a run
+# anyway where pivots are small. At a relative cost of 0.68 (four-bar), it saves 5 % of the time of a run
 MAX_COST_RATIO = 0.75
 
 
@@ -348,7 +348,7 @@ class Elimination:
         return Program(self.graph, {"": []}, conditions)
 
     def _matrix(self) -> dict[tuple[int, int], Affine]:
-        """Return the nonzero entries of [M G^T; G 0], G: independent rows; M with added rows (`choice.added_rows`)."""
+        """Return the nonzero entries of [M G^T; G 0]. G has only the independent rows; M includes added rows."""
         n = self.system.n_q
         matrix = {(i, j): self.mass[i, j] for i in range(n) for j in range(n) if not is_zero(self.mass[i, j])}
         for i, j in matrix:
@@ -370,7 +370,7 @@ class Elimination:
         return matrix
 
     def _solve(self, r: Sequence[Affine], c: Sequence[Affine]) -> tuple[list[Affine], list[tuple[Affine, Affine]]]:
-        """Return [a, lam] with M a + G^T lam = r, G a = c, and conditions, see `solve_refined`; `c`: for all rows."""
+        """Return [a, lam] with M a + G^T lam = r, G a = c, and conditions, see `solve_refined`; c has all rows of G."""
         return solve_refined(self.factors.solve, self.choice, self.mass, self.all_rows, r, c)
 
     def _right_sides(self, v: Sequence[Affine]) -> tuple[list[Affine], list[Affine]]:
@@ -415,7 +415,7 @@ class Elimination:
 
     @cached_property
     def right_sides(self) -> Program:
-        """Return the program for "r", the forces Q, and "c", the right-hand sides of G a = c (0 for unused rows)."""
+        """Return the program for "r" = Q and "c", right-hand sides of G a = c; 0 for rows not in the equations."""
         force, gamma = self._right_sides(self.v)
         used = {*self.choice.rows, *self.choice.added_rows}
         return Program(self.graph, {"r": force, "c": [x if k in used else self.zero for k, x in enumerate(gamma)]})

@@ -69,7 +69,7 @@ class Emitter:
         return self.builder.broadcast_first(self.builder.insert(undefined(vector_of(value.type, self.lanes)), value, 0))
 
     def constant(self, value: float) -> Value:
-        """Return a literal number."""
+        """Return a literal number, the same in all lanes."""
         return constant(self.double_type, value, self.builder)
 
     def load_constant(self, value: float) -> Value:

@@ -191,8 +191,8 @@ def _eliminate(neighbours: list[set[int]], rows: Sequence[int]) -> set[int]:
 PivotBlocks = Sequence[tuple[tuple[int, ...], tuple[int, ...]]]  # rows and columns of each pivot block (one or two)
 Terms = dict[int, Affine]  # nonzero entries of a row of a matrix, by column
 
-# accelerations count as invalid if the square of one of these numbers is below this limit: pivot / norm of the entries
-# that it divides; pivot / norm of its column; in a block of two columns, sine of the angle between them. A number 10^-k
+# below this limit of the squares of the following numbers, accelerations are invalid: pivot / norm of the entries that
+# it divides; pivot / norm of its column; in a block of two columns, sine of the angle between them. A number 10^-k
 # costs up to 3 k digits of accelerations. The choice of pivots has stricter limits, see linalg/dependent_columns.py
 MIN_PIVOT_SQUARE = 0.03**2
 
@@ -237,7 +237,7 @@ class DependentCoordinates:
                 self._substitute(j, self._rows[i])
 
     def _eliminate(self, rows: tuple[int, ...], columns: tuple[int, ...]) -> None:
-        """Solve equations `rows` of G a = gamma for accelerations `columns`; insert these in the other equations."""
+        """Solve the equations `rows` of G a = gamma for the entries `columns` of a; insert these in other equations."""
         self.check_length()
         block = [[self._rows[i].get(j, self._zero) for j in columns] for i in rows]
         pivot, inverse = self._inverse(block)
@@ -342,7 +342,7 @@ def solve_reduced_system(
 
 
 def _pivot_conditions(matrix: dict[tuple[int, int], Affine], factors: Factors) -> Iterator[tuple[Affine, Affine]]:
-    """Yield conditions: a pivot of the reduced mass matrix T^T M T (`matrix`), a fraction of its diagonal entry."""
+    """Yield pairs, of which the first must be larger: a pivot of T^T M T (`matrix`); a fraction of a diagonal entry."""
     pivots = iter(factors.mass_pivots)
     for row_indices, _, _ in factors.blocks:
         first_pivot: Affine | None = None

@@ -93,7 +93,7 @@ class Program:
     conditions: list[tuple[Affine, Affine]] = field(default_factory=list)
 
     def run(self, algebra: Algebra[T], inputs: Sequence[T] = ()) -> list[list[T]]:
-        """Return the arrays of the program in an algebra; `inputs`: values of the inputs, unless already defined."""
+        """Execute the program in an algebra; return its arrays. `inputs`: values of inputs, unless already defined."""
         for quantity, value in enumerate(inputs):
             algebra.define(quantity, value)
         return algebra.run_program(self)

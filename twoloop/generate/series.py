@@ -168,7 +168,7 @@ def series_program(
 
 
 def _find_sums(graph: Graph) -> dict[int, Affine]:
-    """Return the expression of each quantity that is a sum; it replaces the quantity: sums need no recurrence."""
+    """Return the expressions of quantities that are sums; they replace these quantities: sums need no recurrence."""
     sums: dict[int, Affine] = {}
     for i, operation in enumerate(graph.operations):
         if operation is not None and operation[0] == SUM:

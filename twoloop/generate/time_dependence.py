@@ -40,8 +40,8 @@ TIME_MASK = 1  # bit mask of t, the first input of a graph
 class ShortForces(NamedTuple):
     """Whether forces or drives may have short pulses: large values only in a short range of t, or of q or v."""
 
-    by_time: bool  # a force, C_t or b may have short pulses as a function of time
-    by_state: bool  # a force, M, C, C_q or A may have short pulses as a function of q or v
+    by_time: bool  # a force, C_t, or b in A v + b = 0, may have short pulses as a function of time
+    by_state: bool  # a force, M, C, C_q, or A in A v + b = 0, may have short pulses as a function of q or v
 
 
 class Dependence(NamedTuple):
@@ -61,7 +61,7 @@ def find_short_forces(system: ConstrainedSystem, force_was_traced: bool) -> Shor
 
     If callbacks cannot be traced, `by_time` and `by_state` are True. Systems with more than MAX_COORDINATES coordinates
     are not traced; then `by_time` is True, and `by_state` is False. Callbacks that are called in Python may store their
-    arguments, so that symbols might reach later calls: they are traced only if the force was traced before.
+    arguments, so symbols might reach later calls: they are traced only if the force was (`force_was_traced`).
     """
     if system.n_q > MAX_COORDINATES:
         return ShortForces(True, False)
@@ -111,7 +111,7 @@ def _make_analysis(system: ConstrainedSystem) -> Any:
 
 
 class DegreeAlgebra(Algebra[float]):
-    """Algebra of degrees: the value of a quantity is its degree as a polynomial in `inputs`; f(x) has that of x."""
+    """Algebra of degrees: a value is a quantity's degree as a polynomial in `inputs`; sin x, 1 / x, ... count as x."""
 
     functions: Mapping[int, Callable[[float], float]] = MappingProxyType(
         {

@@ -89,7 +89,7 @@ class CallbackTraces:
         refuse_wrong_traces([self], system, t0, t1, q, v)
 
     def check_near_start(self, system: ConstrainedSystem, nearby: Array) -> None:
-        """Compare calls and traces at the states `nearby`; raise Untraceable if they differ, else set `is_trusted`."""
+        """Compare calls and traces at the states `nearby`; raise Untraceable if they differ, else trust the traces."""
         difference = None
         for states in (nearby, *nearby[:, None, :]):  # first all states at once; if a call raises, one after another
             try:
