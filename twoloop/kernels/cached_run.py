@@ -155,8 +155,8 @@ def split_steps(steps, counts, h, changes, used_newton):
 # - UNUSUAL: steps were taken, but Python must read the report, and may have to continue the run
 # - UNCHOSEN: no steps were taken, because Python must check whether the generated code suits this start
 REFUSED, IN_DOUBT, UNUSUAL, UNCHOSEN = -1, -2, -3, -4
-# values of `checks`: Python has checked nothing; that the start satisfies the constraints; also that the generated code
-# suits the start
+# values of `checks`, what Python has checked about a start: nothing; that it satisfies the constraints; in addition,
+# that the generated code suits it
 NOTHING_CHECKED, STATE_CHECKED, CHOICES_CHECKED = 0, 1, 2
 
 # arrays for the checks of a start, for the choice of rows and for steps; successive runs reuse them. Among them are

@@ -138,7 +138,7 @@ def _is_singular(f, w, t, states, i, last, time, q, change):
     """Return True if q at `time` is so near a singular position that rounding explains how the projection changed v.
 
     `change`: change of velocities by the projection, in tolerances; i, `last`: indices of the states at the ends of the
-    interval. For the comparison of pivots see SINGULAR_PIVOT_RATIO and WEAK_PIVOT.
+    interval. For the limits of pivot ratios see SINGULAR_PIVOT_RATIO and WEAK_PIVOT.
     """
     n, largest = w.Q.size, 0.0
     for r in (i, last):

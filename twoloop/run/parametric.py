@@ -114,7 +114,7 @@ class ParametricRun:
             traced.is_trusted = False
 
     def callbacks_agree(self, t0: float, q: Array, v: Array, t1: float, mass: Array, with_derivatives: bool) -> bool:
-        """Return whether callbacks agree with traces near the start, and M is as definite and diagonal as before."""
+        """Return whether callbacks agree with traces near the start, and `mass` is definite or diagonal as before."""
         run, system = self.run, self.system
         if not self._mass_agrees:
             system.remember_at("definite mass", None, is_definite(mass))

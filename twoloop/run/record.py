@@ -147,7 +147,7 @@ class OutputRequest(NamedTuple):
 class Recorder:
     """Recorder of the states of accepted steps, chunk by chunk.
 
-    A step is searched for events when all states that its polynomials interpolate are known: chunks do not matter then.
+    A step is searched for events once all states that its polynomials interpolate are known. So chunks do not matter.
     Event functions are evaluated at least every `max_gap` seconds.
     """
 

@@ -195,7 +195,7 @@ class RerunPiece(NamedTuple):
 class IndependentRerun:
     """Integrator that reruns pieces of a run with another method; each piece starts from a state of the run.
 
-    (t, q, v): any state of the run, for which arrays are allocated. `method`: "explicit" for `DOP853`; for stiff pieces
+    (t, q, v): any state of the run, to set up the arrays. `method`: "explicit" for `DOP853`; for stiff pieces
     "all" or "positions", a Radau method whose error test includes all components, or only positions.
     """
 

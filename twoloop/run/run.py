@@ -420,7 +420,7 @@ class Run:
         return float(notes[indices.LARGEST_DEFECT]) if is_checked else None
 
     def passed_near_singular(self) -> bool:
-        """Return whether the run passed near a singular position at an output time, or at the end of a fixed step.
+        """Return whether the run passed near a singular position at an output time, or where a step of fixed size ends.
 
         Rounding may have changed velocities there.
         """

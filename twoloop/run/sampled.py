@@ -184,7 +184,7 @@ class SampledRun:
         """Integrate once from the last stored state to the time `end`."""
         run, a, clock = self.run, self.run.a, self.run.clock
         t = self.times[-1]
-        # a callback called in Python may read global variables that have changed since the last call of `step`
+        # restart also if callbacks called in Python may read variables that have changed since the last call of `step`
         if self._parameters_changed or self.system.called_in_python:
             self._restart(t)
         run.choose_first_step(self.t0, end, run.state, run.max_step)

@@ -141,7 +141,7 @@ def has_velocity_jump_at_end(times: Array, rows: Array, n: int) -> bool:
 
 
 def _crossing_ends(crossings: Crossings, end_state: TimedState) -> Iterator[tuple[TimedState, TimedState, bool]]:
-    """Yield the states before and after a singular position, and True for crossing steps, False for ordinary ones."""
+    """Yield the states before and after a singular position, and whether crossing steps (not ordinary ones) crossed."""
     before: TimedState | None = None
     for first, *after in crossings:
         before = first if before is None else before
@@ -227,7 +227,7 @@ def velocity_rounding_errors(system: ConstrainedSystem, t: float, q: Array, v: A
             row_slopes = np.abs(np.subtract(*(system.rows(t, each) for each in displaced)))
         except (ArithmeticError, ValueError):  # a square root, for example, fails beyond a dead centre
             return np.full(len(q), np.nan)
-        # entries of the Jacobian, to which rounding errors of constraints are proportional, may be small at q by chance
+        # rounding errors of constraints: proportional to the Jacobian near q, as entries at q may be small by chance
         nearby_rows = np.abs(rows) + (row_slopes * (np.abs(rows).max() / row_slopes.max()) if row_slopes.any() else 0.0)
         rounding = ROUNDING * np.sqrt((nearby_rows * nearby_rows) @ (q * q))
         errors = np.maximum(

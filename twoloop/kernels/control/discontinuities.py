@@ -175,8 +175,8 @@ MIN_RECORDED_TIME = 5e-5
 MIN_STEEPNESS_RATIO = 2.0  # a change between two samples is sudden if it exceeds this times the changes next to it
 SHORT_STEP = 0.5  # steps below this fraction of the longest of the last steps may be short because of a discontinuity
 N_SAMPLES_IN_SHORT_STEP = 4  # number of samples within a short step
-# accelerations do not last (see _acceleration_lasts) if one of them changes by more than this fraction of the largest
-# when velocities change by their tolerances
+# accelerations do not last (see _acceleration_lasts) if an acceleration changes by more than this fraction of the
+# largest acceleration when velocities change by their tolerances
 MAX_LASTING_CHANGE = 0.5
 CHANGE_MARGIN = 0.01  # a change at most this number of sample spacings after the beginning of a step counts as passed
 # rows of w.changes, whose columns are the forces, C_t and b: rows 0 to N_SAMPLES are the samples of one set
@@ -187,7 +187,7 @@ N_CHANGES = N_SAMPLES + 3  # number of rows of w.changes
 
 @compiled
 def _sample_forces(f, w, time, elapsed, q, v, a, values):
-    """Store forces, C_t and b at `time` in `values`, at the state reached from (q, v) in `elapsed` s at constant a."""
+    """Store forces, C_t and b at `time` in `values`, for the state `elapsed` s after (q, v) with constant a."""
     for m in range(q.size):
         w.x[m] = q[m] + elapsed * (v[m] + 0.5 * elapsed * a[m])
         w.y[m] = v[m] + elapsed * a[m]

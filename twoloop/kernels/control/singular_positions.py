@@ -28,7 +28,7 @@ FREEDOMS_PER_CHECK = 32
 N_CHECKED_PARTS = 8  # number of equal parts of a step between which `comes_near_singular` computes the smallest pivot
 # pivots within a step are computed if the smallest pivot at one of its ends is below this fraction of LARGEST_PIVOT
 MAX_UNCHECKED_PIVOT = 0.5
-# `comes_near_singular` samples the smallest pivot within a step. It may be zero between two samples if one of them is
+# `comes_near_singular` samples the smallest pivot in a step. This may be zero between two samples if one of them is
 # below this fraction of the largest change from sample to sample
 PASSED_PIVOT_RATIO = 0.6
 # MIN_NEAR_RATIO, MAX_NEAR_RATIO: limits of the result of `near_pivot_ratio`. MAX_ROUNDING_ERROR: allowed rounding error

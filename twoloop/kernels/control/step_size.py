@@ -121,7 +121,7 @@ H_LONG_DECAY = 0.98  # each accepted step multiplies clock[H_LONG], the longest 
 
 @merged
 def count_step(w, tolerances, control, clock, size, out_step):
-    """Count an accepted step of size `size` (s): update clock[H_LONG] and statistics in w, and fill `out_step`."""
+    """Count an accepted step of size `size` (s): update clock[H_LONG] and statistics in w; fill `out_step`, its row."""
     w.n_accepted += 1
     if w.defect >= 0.0:
         w.largest_defect = max(w.largest_defect, w.defect)

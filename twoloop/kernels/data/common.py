@@ -300,7 +300,7 @@ def _helper_decorator(**options: Any) -> Callable[[Callable[..., Any]], Dispatch
 exact = _helper_decorator(fastmath=False, forceinline=False)  # keeps the order of floating-point operations
 compiled = _helper_decorator(forceinline=False)  # compiled as a function, which LLVM inlines only if it is short
 inlined = _helper_decorator(inline="always")  # inlined by numba; only a helper of this kind can return views of arrays
-# LLVM replaces each call by a copy of the code. For short helpers, and for helpers used in every evaluation
+# LLVM replaces each call by a copy of the code: for helpers that are short, or used in every evaluation
 merged = _helper_decorator(forceinline=True)
 
 
@@ -351,7 +351,7 @@ def _type_of_kit(value: Any, context: Any) -> Any:
     return KIT
 
 
-# indices of callbacks in Functions: values of w.fault_kind, the callback that returned NaN or infinity
+# indices of callbacks in Functions; w.fault_kind is one of them, that of the callback that returned NaN or infinity
 MASS, FORCE, CONSTRAINT, JACOBIAN, RATE, GAMMA = (
     Functions._fields.index(kind) for kind in ("mass", "force", "constraint", "jacobian", "constraint_rate", "gamma")
 )
