@@ -126,13 +126,13 @@ MAX_OPERATIONS = 5000  # equations with more operations get no collocation code;
 MIN_DIVISOR = 1e-300  # smaller divisors and allowed errors are replaced by this, so that nothing is divided by zero
 INVALID = -1.0  # result of `find_defect` if the accelerations are invalid (defects are never negative)
 INFINITE = float("inf")
-# if the fixed pivots of null_space.py fail in a step, this many later steps use the elimination that begins with M
+# if fixed pivots (null_space.py) get too small in a step, this many later steps use the elimination beginning with M
 STEPS_BY_MASS_FIRST = 8.0
 FIRST_DEGREE = 3.0  # degree of the polynomial that predicts the accelerations in the second step
 
 # constants of the iteration. Its contraction, rho, is the ratio of the changes of velocities in two successive sweeps
 KAPPA = 0.02  # sweeps end if the estimated error of the iteration, relative to the tolerances, is at most this
-TARGET_SWEEPS = 6.0  # step sizes are chosen for this number of sweeps; 1 more if the prediction has degree 6, 2 if more
+TARGET_SWEEPS = 6.0  # step sizes are chosen for this number of sweeps; +1 if the prediction has degree 6, +2 if 7 or 8
 EXTRA_SWEEPS = 7  # a step is rejected if it takes this number of sweeps more than the target and has not converged
 MAX_CONTRACTION = 0.8  # if the contraction is at least this in the fourth sweep or later, the step is rejected
 MIN_RHO, MAX_RHO = 1e-3, 0.9  # bounds to which a measured contraction is clipped

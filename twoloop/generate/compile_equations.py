@@ -37,7 +37,7 @@ from twoloop.problem.system import ConstrainedSystem
 
 DOUBLE_POINTER = f"{DOUBLE}*"
 # if generated code adds rows of G to M, or refines solutions (see PivotChoice), the relative error of its accelerations
-# is measured near the start (`_loss`). Above this limit, the code is refused. During runs, errors grew up to 200 times
+# is measured near the start (`_loss`). Above this limit, raise Untraceable. During runs, errors grew up to 200 times
 LARGEST_LOSS = 1e-8
 MAX_POSITIONS, DISTANCE = 4, 0.02  # `_loss` tries at most this number of positions, with this spacing (m or rad)
 

@@ -493,7 +493,7 @@ class _PartialSums(NamedTuple):
     """Sums of X[j] Y[k - j] over 1 < j < k, and the rows needed to add the terms j = 1 and j = k, which are missing."""
 
     sums: dict[tuple[tuple[int, int], bool], Value]  # keys: ((X, Y), whether for order k + 1); X, Y: indices
-    first_row: Value  # pointer to the row of order 1, or to a row of zeros if k is 1
+    first_row: Value  # pointer to the row of order 1; if k is 1, to a row of zeros: sums then have a term less
     row_1: Value  # pointer to the row of order 1
     row_before: _Row  # row of order k - 1
 
