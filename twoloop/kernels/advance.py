@@ -127,8 +127,8 @@ def _attempt_step(f, w, options, memory, tolerances, control, clock, t, size, cr
 def _must_repeat_at_jump(f, w, tolerances, control, clock, t, size, accepted, state, new_state):
     """Return True if a step (`accepted` or not) must be repeated because C_t or b jumps or has a steep ramp in it.
 
-    For a jump, store the interval that contains it in clock[JUMP_FROM] and clock[JUMP_TO]. For a ramp, store the next
-    step size in clock[H_NEXT].
+    For a jump, store the times just before and after it in clock[JUMP_FROM] and clock[JUMP_TO]. For a ramp, store the
+    next step size in clock[H_NEXT].
     """
     kind, low, high = _locate_rate_jump(f, w, t, size, tolerances, accepted, state, new_state)
     if kind == JUMP:

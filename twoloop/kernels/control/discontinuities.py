@@ -18,8 +18,8 @@ ahead of the step (`f`: kit, `w`: workspace), which costs less than evaluations 
 A jump of C_t or b, for example at the end of a ramp in a drive, changes velocities as an impulse does. Methods that
 correct only dependent velocities after the jump would violate the balance of momentum. So, if velocities change in a
 step by more than accelerations explain, C_t and b are sampled at thirteen times in the step. If they are smooth on the
-scale of the step, the twelfth difference of these samples is almost zero, and falls by 2^12 if the interval is halved.
-If C_t or b jumps, the difference is as large as the jump, also in that half of the interval that contains the jump.
+scale of the step, the twelfth difference of these samples is almost zero, and falls by 2^12 if the span is halved.
+If C_t or b jumps, the difference is as large as the jump, also in that half of the time span that contains the jump.
 """
 
 import numpy as np
@@ -32,7 +32,7 @@ from twoloop.kernels.evaluation.constraints import constraint_rates, representab
 from twoloop.kernels.linalg.dense import largest_of
 from twoloop.kernels.linalg.symbolic_factorization import jacobian_entries_of
 
-N_PARTS = 12  # C_t and b are sampled at the ends of this number of equal parts of an interval
+N_PARTS = 12  # C_t and b are sampled at the ends of this number of equal parts of a time span
 # coefficients of the thirteen samples in the twelfth difference
 BINOMIAL = (1.0, -12.0, 66.0, -220.0, 495.0, -792.0, 924.0, -792.0, 495.0, -220.0, 66.0, -12.0, 1.0)
 MAX_BISECTIONS = 60  # largest number of bisections that locate a jump or a ramp of C_t or b
@@ -40,8 +40,8 @@ RATE_ROUNDING = 1e-11  # error of the twelfth difference due to rounding of samp
 TIME_ROUNDING = 5e3  # error of the twelfth difference due to rounding of t, relative to np.spacing(t) * (mean slope)
 STEEPNESS = 4.0  # a part of a step is a ramp if C_t or b is this number of times steeper there than in the whole step
 MAX_RAMP_SHARE = 0.125  # a step must end at a ramp of C_t or b that takes at most this fraction of the step
-MIN_SPACINGS = 8.0  # bisection ends at an interval of this number of spacings of floating-point numbers
-SMOOTH, RAMP, JUMP = range(3)  # results of locate_discontinuity for C_t and b in an interval
+MIN_SPACINGS = 8.0  # bisection ends at a time span of this number of spacings of floating-point numbers
+SMOOTH, RAMP, JUMP = range(3)  # results of locate_discontinuity for C_t and b in a time span
 
 
 @compiled
@@ -158,7 +158,7 @@ def locate_discontinuity(f, w, t, end, q, v, velocity, tolerances):
     return SMOOTH, t, t + h
 
 
-N_SAMPLES = 20  # number of intervals between the samples of one set, which therefore has 21 samples
+N_SAMPLES = 20  # number of spacings between the samples of one set, which therefore has 21 samples
 MIN_TIME_AHEAD = 12.0  # shortest time over which the motion is sampled ahead, in units of control[SPACING]
 SUDDEN_RATIO = 0.1  # a change is sudden if the second difference exceeds this fraction of the range of the samples
 # changes of a force, C_t or b are ignored if the range of the samples is at most LEAST_RANGE * rtol times the largest

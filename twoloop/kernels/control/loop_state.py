@@ -86,7 +86,7 @@ H, ERRORS, FAILURES, PARTITIONS, JACOBIANS, N_STEP_COLUMNS = range(6)
     H_LONG,  # longest recent step (s): after a step, the larger of its size and H_LONG_DECAY times the old H_LONG
     LARGEST_PIVOT,  # largest value so far of w.pivot, the smallest pivot in the elimination of C_q
     JUMP_FROM,  # a constraint rate (C_t, b) jumps between this time (s) and JUMP_TO; infinite: no later jump is known
-    JUMP_TO,  # end (s) of the short interval with the next known jump of a constraint rate (C_t, b)
+    JUMP_TO,  # end (s) of the short time span with the next known jump of a constraint rate (C_t, b)
     APPLIES_JUMP,  # 1: the next step ends at JUMP_TO, in the state that `new_state` already contains; 0: ordinary step
     JUMP_END,  # end (s) of the last step rejected with a very large error: a force may jump before this time
     PIVOT_HERE,  # fixed-order form: smallest pivot, w.pivot, at the end of the last step
