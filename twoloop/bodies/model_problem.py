@@ -28,6 +28,7 @@ from twoloop.checks.arguments import Array, check_finite, check_positive, check_
 from twoloop.problem.description import Stop
 from twoloop.problem.problem import Problem
 from twoloop.problem.system import ConstrainedSystem
+from twoloop.run.signals import SignalHandlers
 
 Given = tuple[tuple[str, str, float], ...]  # joint, "angle" or "displacement", value
 UNCOUNTED = (
@@ -272,7 +273,8 @@ class Model(Ropes):
             raise TypeError(f"keep must be a list of bodies, or of their names; given {shown(keep)}")
         kept = tuple(j for each in keep for j in self._moving_body("keep", each).coordinates)
         given = tuple(self._given(*each) for each in (("positions", positions), ("rates", rates)))
-        return self.assemble(span, name, kept, None, None, *given)
+        with SignalHandlers():  # functions are traced, which catches exceptions, also those of signal handlers
+            return self.assemble(span, name, kept, None, None, *given)
 
     def _given(self, what: str, given: Any) -> Given:
         """Check the given positions or rates of joints; return them as tuples."""

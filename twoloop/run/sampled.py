@@ -157,11 +157,11 @@ class SampledRun:
 
     def step(self, dt: float) -> SampledState:
         """Integrate for a time dt (s) from the last stored state; store the final state, and return it."""
-        if self._step_failed:
-            self._return_to_sample()
         end, began = self.times[-1] + dt, time.process_time()
-        self._step_failed = True  # remains True if a callback raises an exception before the step is complete
         with signals_of(self.system):
+            if self._step_failed:
+                self._return_to_sample()
+            self._step_failed = True  # remains True if a callback raises an exception before the step is complete
             self._step_to(end)
         self.cpu_time += time.process_time() - began
         self._store_sample(end)

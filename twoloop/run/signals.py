@@ -3,8 +3,8 @@
 # `_signal` is faster than `signal`, whose functions take 8 microseconds to convert each handler to an enum member
 import _signal  # type: ignore[import-not-found]
 import signal
+import sys
 import threading
-from contextlib import AbstractContextManager, nullcontext
 from types import FrameType, TracebackType
 from typing import Any
 
@@ -32,19 +32,23 @@ class SignalHandlers:
 
     def __init__(self, ctrl_c: bool = False) -> None:
         self._user_handlers: dict[int, Any] = {}
-        self._delayed_calls: list[tuple[int, FrameType | None]] = []
+        self._delayed_calls: list[int] = []  # numbers of signals
         self._handler_error: BaseException | None = None
-        for number in SIGNAL_NUMBERS:
-            handler = _signal.getsignal(number)
-            if callable(handler) and (ctrl_c or handler is not signal.default_int_handler):
-                if threading.current_thread() is not threading.main_thread():
-                    break  # Python calls signal handlers in the main thread only
-                self._user_handlers[number] = handler
-                _signal.signal(number, self._receive)
+        try:
+            for number in SIGNAL_NUMBERS:
+                handler = _signal.getsignal(number)
+                if callable(handler) and (ctrl_c or handler is not signal.default_int_handler):
+                    if threading.current_thread() is not threading.main_thread():
+                        break  # Python calls signal handlers in the main thread only
+                    self._user_handlers[number] = handler
+                    _signal.signal(number, self._receive)
+        except BaseException:  # raised by a handler that has been called meanwhile
+            self.restore()
+            raise
 
     def _receive(self, number: int, frame: FrameType | None) -> None:
         if is_in_compiler(frame):
-            self._delayed_calls.append((number, frame))
+            self._delayed_calls.append(number)
         else:
             self._call_handler(number, frame)
 
@@ -58,7 +62,8 @@ class SignalHandlers:
     def call_delayed(self) -> None:
         """Call the handlers whose calls were delayed; if a handler has raised an exception, raise it again."""
         while self._delayed_calls and self._handler_error is None:
-            self._call_handler(*self._delayed_calls.pop(0))
+            # the frame of the signal is in the compiler: with it, another SignalHandlers would delay the call again
+            self._call_handler(self._delayed_calls.pop(0), sys._getframe())
         if self._handler_error is not None:  # not reset here: `restore` raises it again if the caller catches it
             raise self._handler_error from None
 
@@ -78,9 +83,9 @@ class SignalHandlers:
         self.restore()
 
 
-def signals_of(system: ConstrainedSystem) -> AbstractContextManager[Any]:
-    """Return the context for machine code: `SignalHandlers` if it calls Python callbacks, else one without effect."""
-    return SignalHandlers(ctrl_c=True) if system.called_in_python else nullcontext()
+def signals_of(system: ConstrainedSystem) -> SignalHandlers:
+    """Return the context for work with the callbacks of a system, whose exceptions this work may catch."""
+    return SignalHandlers(ctrl_c=system.called_in_python)
 
 
 def is_in_user_function(frame: FrameType | None) -> bool:
