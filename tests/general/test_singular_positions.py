@@ -9,6 +9,7 @@ from scipy.integrate import solve_ivp
 from tests.general.mechanisms import SINGULAR, WINDOWS, error, first_singular_time, mechanism, run
 from tests.general.systems import CUSP_TIME, cusp
 from tests.marks import slow
+from tests.problems import run as run_problem
 from tests.problems import worst
 from twoloop import DOP853, ConstraintWarning, Integrator, Status, solve_dae
 from twoloop.bodies import PlanarModel
@@ -141,10 +142,7 @@ MORE = [("ESDIRK4", 1e-3), ("BDF", 1e-3), ("RadauIIA5", 1e-3), ("Adams", 1e-6), 
 @pytest.mark.filterwarnings("ignore:the run (begins|ends) where:twoloop.ConstraintWarning")
 @pytest.mark.parametrize(("method", "tolerance"), [("auto", 1e-3), ("TRBDF2", 1e-6), *(slow(*each) for each in MORE)])
 def test_no_run_that_begins_beside_a_singular_position_succeeds_on_another_branch_without_a_word(method, tolerance):
-    """Both branches are within the tolerance there, and the pivots of the start are small themselves.
-
-    Rounding decides which of a hundred such runs turn; all say so in their message and by a warning.
-    """
+    """Both branches are within the tolerance there. Rounding decides which runs turn; all of these say so."""
     for angle, speed in ((4.3e-6, -5.0), (3.5e-5, -0.134), (1.3e-6, -0.0715), (1e-6, -5.0), (1e-5, -1.0), (4e-6, 3.0)):
         problem = parallelogram(angle, speed)
         for end in (2.0 * angle / abs(speed), 0.5):
@@ -190,8 +188,7 @@ def test_a_swing_that_turns_back_beside_a_singular_position_crosses_it_slowly_an
     pull = 15.0 / 13.0 * 9.81  # two cranks with their coupler are a pendulum
     y0 = -1.0, np.sqrt(2.0 * pull * (np.sin(turn) + np.sin(1.0)))
     exact = solve_ivp(lambda t, y: (y[1], -pull * np.cos(y[0])), (0.0, 3.0), y0, "DOP853", rtol=1e-13, atol=1e-13).y
-    problem = parallelogram(*y0)
-    result = solve_dae(problem.system, (0.0, 3.0), problem.q0, problem.v0, rtol=tolerance, atol=tolerance)
+    result = run_problem(parallelogram(*y0), 3.0, rtol=tolerance, atol=tolerance)
     assert result.success and worst(result.q[[2, 5], -1], [exact[0, -1], 0.0]) < 100.0 * tolerance, result.message
 
 
@@ -236,9 +233,7 @@ def test_samples_within_one_step_across_a_singular_position_are_as_accurate_as_i
     """The first passage is within one ordinary step: samples erred by 28,000 and 390 tolerances, its ends by 1."""
     problem, times = n_four_bar(n, coordinates), np.linspace(0.6, 0.9, 151)
     with warnings.catch_warnings(action="ignore", category=ConstraintWarning):
-        result = solve_dae(
-            problem.system, (0.0, end), problem.q0, problem.v0, rtol=tolerance, atol=tolerance, t_eval=times
-        )
+        result = run_problem(problem, end, rtol=tolerance, atol=tolerance, t_eval=times)
     exact = np.array([np.concatenate(problem.motion(t)) for t in times]).T
     assert np.abs(np.concatenate([result.q, result.v]) - exact).max() < 30.0 * tolerance
 
