@@ -105,7 +105,7 @@ def test_a_rhombus_of_ones_own_has_a_reference_across_its_folds():
     span = (0.0, drawn["t_end"])
     own = Problem("own", drawn["system"], drawn["q0"], drawn["v0"], span, lambda t, q, v: 0.0)
     motion = reference_motion.make_reference(own, span[1])
-    assert "Taylor and DOP853" in motion.source and motion.floor < 1e-9
+    assert "and DOP853 (both two-loop)" in motion.source and motion.floor < 1e-9
     assert np.abs(motion.states(np.array(span))[0][:, 1] - drawn["positions"](span[1])).max() < 1e-9
 
 
