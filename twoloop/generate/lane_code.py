@@ -657,7 +657,7 @@ class LaneCode(LaneSteps):
         return orientation_change_mask(emit, *(self._row_values(emit, memory, *end) for end in ends_of_step))
 
     def _row_values(self, emit: LaneEmitter, memory: LaneMemory, time: int, base: Value) -> list[dict[int, Value]]:
-        """Write code for the nonzero entries of each row of G, returned by column; `time`: T or T_NEW; `base`: q, v."""
+        """Write code for G; return {column: entry} for each row; `time`: T or T_NEW; `base`: address of [q, v]."""
         inputs = [emit.load(memory.work, time), *(emit.load(base, i) for i in range(2 * self.n))]
         _, (entries,) = lower_program(emit, self._row_program, inputs, self.numbers)
         rows: list[dict[int, Value]] = [{} for _ in self.equations.rows]
@@ -718,8 +718,8 @@ class LaneConstraints(LaneSteps):
 
 
 SECONDS_PER_QUANTITY = 3e-4  # estimated time (s) to compile one operation
-ELIMINATION_MODULES = (elimination, null_space, compile_equations)  # modules that write the code of accelerations
-# modules that write the code: cached code is invalid after a change of one of them
+# modules that write code: after a change of one of them, code in the cache on the disk is not used any more
+ELIMINATION_MODULES = (elimination, null_space, compile_equations)  # they write code that computes accelerations
 CODE_MODULES = (series, *ELIMINATION_MODULES, program, lane_series, llvm_code, llvm_text)
 
 Code = TypeVar("Code", LaneCode, LaneConstraints)

@@ -325,7 +325,7 @@ def _refusing_method(name: str) -> Callable[..., Any]:
 _REFUSED_METHODS = ("bool", "int", "float", "trunc", "floor", "ceil", "round", "lt", "le", "gt", "ge", "eq", "ne")
 for _name in (*_REFUSED_METHODS, "mod", "rmod", "floordiv", "rfloordiv", "divmod", "rdivmod"):
     setattr(Parameter, f"__{_name}__", _refusing_method(f"__{_name}__"))
-Parameter.__hash__ = float.__hash__  # type: ignore[method-assign]
+Parameter.__hash__ = float.__hash__  # type: ignore[method-assign]  # although `__eq__` was replaced above
 for _symbol, _name in {"add": "add", "sub": "subtract", "mul": "multiply", "truediv": "divide", "pow": "power"}.items():
     setattr(Parameter, f"__{_symbol}__", _binary_operator(_name, False))
     setattr(Parameter, f"__r{_symbol}__", _binary_operator(_name, True))

@@ -134,11 +134,10 @@ def series_for(system: ConstrainedSystem, check: Check = accept_traces) -> Serie
 def series_program(
     system: ConstrainedSystem, equations: Equations | None = None, independent: Container[int] | None = None
 ) -> SeriesProgram:
-    """Trace the callbacks of a system and return its series program.
+    """Trace the callbacks of a system; return the program that computes the Taylor series of its motion.
 
-    `equations`: traces whose graph the program extends; None: new traces. `independent`: indices of the rows of G that
-    the program contains; None: all rows.
-
+    `equations`: earlier traces, to whose graph operations are added; None: trace the callbacks now. `independent`:
+    indices of the constraints (rows of G) that the program contains; None: all rows.
     Raise Untraceable if a callback cannot be traced; the message names the callback and the reason.
     """
     equations = Equations(system) if equations is None else equations
@@ -168,7 +167,7 @@ def series_program(
 
 
 def _find_sums(graph: Graph) -> dict[int, Affine]:
-    """Return the expressions of quantities that are sums; they replace these quantities: sums need no recurrence."""
+    """Return, for each quantity that is a sum, its terms; these replace it in expressions. Sums need no operation."""
     sums: dict[int, Affine] = {}
     for i, operation in enumerate(graph.operations):
         if operation is not None and operation[0] == SUM:
@@ -177,7 +176,7 @@ def _find_sums(graph: Graph) -> dict[int, Affine]:
 
 
 def _expand_sums(sums: dict[int, Affine], expr: Affine) -> Affine:
-    """Return an expression in which the terms of sums replace quantities that are sums; `sums`: see `_find_sums`."""
+    """Return `expr` with each quantity that is a sum replaced by the terms of this sum; `sums`: see `_find_sums`."""
     sum_quantities = [i for i in expr.terms if i in sums]
     if not sum_quantities:
         return expr
@@ -226,9 +225,9 @@ def _sum_of_products(
 
 
 def _normalized_product(factor: Affine, multiplier: Affine) -> tuple[Any, float, Affine, Affine]:
-    """Return key, scale, first and second with factor * multiplier = scale * first * second.
+    """Write factor * multiplier as scale * first * second; return (key, scale, first, second).
 
-    Products that differ only by a constant factor have equal keys, so that one operation computes them.
+    Products that differ only by a constant factor have equal keys (for a dict), so that one operation computes them.
     """
     scale, multiplier = multiplier.normalized()
     return (factor.key, multiplier.key), scale, factor, multiplier

@@ -45,7 +45,7 @@ class ShortForces(NamedTuple):
 
 
 class Dependence(NamedTuple):
-    """Result of the analysis of the callbacks of a system; all systems with the same TraceCache share it."""
+    """Result of the analysis of a system's callbacks; all systems with the same TraceCache share it."""
 
     short_forces: ShortForces
     is_steep: bool  # whether forces or drives may be steep, see `forces_may_be_steep`
@@ -160,7 +160,7 @@ class DivisorDegrees(DegreeAlgebra):
         self._degrees = degrees
 
     def operation(self, kind: int, first: Affine, second: Affine | None) -> float:
-        """Return the total degree of the divisors in the result of an operation."""
+        """Return the sum of the degrees, as polynomials in `inputs`, of all divisors in an operation's formula."""
         degree = super().operation(kind, first, second)
         return degree + self._degrees.affine(first) if kind in (RECIPROCAL, ARCTANGENT) else degree
 

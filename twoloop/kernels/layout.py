@@ -39,9 +39,10 @@ ArrayRanges = list[tuple[str, int, int, tuple[int, ...]]]  # for each array: nam
 class Layout(NamedTuple):
     """Offsets of the arrays of a workspace, which consists of a block of floats and a block of integers.
 
-    A workspace passes a table of the addresses and shapes of its arrays to kernels. This is `table` + `of_numbers` *
-    (address of the floats) + `of_integers` * (address of the integers). The first `n_lasting` floats and
-    `n_lasting_integers` integers keep data from one step to the next; a step fills all others before it reads them.
+    Kernels receive a table of the addresses and shapes of the arrays. `table` is this table with offsets (bytes) within
+    the blocks in place of addresses. Where entries of `of_numbers` (`of_integers`) are 1, the address of the block of
+    floats (integers) must be added; all others are 0. The first `n_lasting` floats and `n_lasting_integers` integers
+    keep data from one step to the next; a step fills all others before it reads them.
     """
 
     numbers: ArrayRanges

@@ -84,7 +84,6 @@ SHORT_RUN = 1e-3  # if the last run took less CPU time (s) than this, elapsed ti
 HARMLESS = 0.01  # v0 is accepted if projecting it onto the constraints changes it by at most this number of tolerances
 REACHED_END = Status.REACHED_END  # a global name is read faster than a member of an Enum
 
-
 STEPS = OutputRequest()  # request for output at the ends of all steps, without dense output and events
 
 
@@ -221,7 +220,7 @@ class CachedIntegrator:
         return fields
 
     def _pivots_suit_start(self, t0: float, q0: Array) -> bool:
-        """Return whether the generated code suits (t0, q0), where M and the rows of C_q and A are those in `arrays`."""
+        """Return whether the generated code is valid at (t0, q0); `self.arrays` must hold M, C_q and A there."""
         system, arrays = self.evaluation.system, self.arrays
         system.remember_at("mass and rows", (t0, q0.tobytes()), (arrays.mass.copy(), arrays.rows.copy()))
         return self.code is not None and self.code.is_valid_from(system, t0, q0)
@@ -299,7 +298,7 @@ class CachedIntegrator:
         return self.parametric is None or self.parametric.callbacks_agree(run.t0, q0, v0, t1, mass, derivatives)
 
     def _use_independent_rows(self, rows: bytes) -> None:
-        """Set the redundant constraint rows and the warning about them; `rows`: indices of the other rows, as bytes."""
+        """Set the redundant rows, and the warning about them, that belong to independent rows (indices, as bytes)."""
         run = self.run
         run.redundant, run.rows_warning = self.redundancy[rows]
         self.run_fields, self.independent_rows = (run.rank, run.redundant, self.run_fields[-1]), rows
@@ -466,7 +465,8 @@ class CacheEntry(NamedTuple):
     shared: SharedSetup | None = None  # setup shared with systems that differ only in their parameters
 
 
-# a system's cache before its first run: last start; entries by options; id() of the code generated for the last run
+# cache of a system's runs before the first run. Items: start (t0, q0, v0) of the last run, or None; dict from options
+# to cache entries; id() of the code that was generated for the last run, or None if that run reused a cache entry
 EMPTY_CACHE: tuple[Any, dict[Any, tuple[CacheEntry, ...]], int | None] = (None, {}, None)
 
 

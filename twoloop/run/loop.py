@@ -154,7 +154,7 @@ STATUSES_WITH_STIFFNESS_NOTE = {Status.REACHED_END, Status.EVENT, Status.MAX_STE
 N_RECENT, N_LAST_STATES = 16, 256
 CROSSING_OVERSHOOT = 100.0  # a crossing step may end beyond t1 by at most this multiple of the run's duration
 NO_KINDS = np.zeros(0, dtype=np.int64)  # kinds of intervals if no states between steps are requested
-# largest number of sets of buffers kept for later runs, and of floats in the buffer of states of such a set
+# largest number of sets of buffers kept for later runs; a set with more floats in its buffer of states is not kept
 MAX_SPARE, MAX_SPARE_FLOATS = 16, 250_000
 _spare_buffers: dict[tuple[int, int, int], Buffers] = {}  # sets of buffers for later runs, by their sizes
 
@@ -162,9 +162,9 @@ _spare_buffers: dict[tuple[int, int, int], Buffers] = {}  # sets of buffers for 
 class IntegrationLoop:
     """Loop that integrates a run to its end, and records it.
 
-    The run is at its start, or a first chunk of steps was taken: then `start` is the row [q, v, a, lam] at the start,
-    and `add_first_chunk` has to be called. `system`: system for the result, needed if later runs will overwrite arrays
-    of `run.system`. After each chunk (call of compiled code), `report` is called with the time reached. If
+    `start`: None if the run is at its start. If the caller has already taken the first chunk of steps, `start` is the
+    row [q, v, a, lam] at the start, and the caller then calls `add_first_chunk`. `system`: system for the result, given
+    if later runs will overwrite arrays of `run.system`. After each chunk, `report` is called with the time reached. If
     `is_final_attempt`, warn if the run may have missed short changes of forces; else the caller repeats such a run.
     """
 
@@ -393,7 +393,7 @@ class IntegrationLoop:
                 self.kit = run.kit
 
     def _last_states(self) -> list[TimedState]:
-        """Return past states at which the polynomial of a crossing step may begin; [] if states are not recorded."""
+        """Return past states; the polynomial across a singular position begins at one of them. []: none is recorded."""
         if not self.request.every_step:
             return []
         states: list[TimedState] = [(self.run.t0, self.start)]
@@ -404,7 +404,7 @@ class IntegrationLoop:
         return ends[-N_RECENT:] + states[-N_RECENT:]
 
     def _correct_last_state(self) -> None:
-        """Replace [q, v, a] of the last recorded state by those of the run, which are on a crossing's polynomial."""
+        """Replace [q, v, a] in the last recorded state by the run's state, which the polynomial of a crossing gave."""
         run = self.run
         t, row = float(run.clock[run.a.T]), run.state[: 3 * run.system.n_q]
         self.recorder.correct_last_state(t, row)

@@ -62,7 +62,7 @@ def read_trusted(path: Path) -> bytes:
 
 
 def replace_trusted(path: Path, content: bytes) -> None:
-    """Write `content` to a new file that replaces `path` at once; only the user can write it, whatever the umask."""
+    """Replace the file `path` atomically by a new one with `content`, which only the user can write (any umask)."""
     make_trusted_folder(path.parent)
     unfinished = path.with_suffix(f".{uuid.uuid4().hex}")
     try:

@@ -310,11 +310,11 @@ NO_NUMBERS = np.zeros(0)  # Kit.numbers if there are no generated functions that
 class Kit:
     """Functions and data of a system and a method, passed to kernels as one reference.
 
-    `functions`: callbacks and data of the system. `inner`: the inner loop. `step`: functions of the method, or None if
-    no kernel calls them; `first`, `second`: the same for both methods of a pair. Kernels call these functions by their
-    addresses, without compiling them again. `own`: functions generated for the mechanism, if there are any. If `inner`
-    calls them, it leaves all other tasks to `general`, the inner loop for any mechanism. `numbers`: data that generated
-    functions read; `own_numbers`: data that the generated functions of collocation read.
+    `functions`: callbacks and data of the system. `step`: functions of the method; None: no kernel calls them. If the
+    run may switch between two methods, `first` and `second` are the functions of each. Kernels call all these functions
+    by their addresses, without compiling them again. `own`: functions generated for the mechanism, or (). `inner`: the
+    inner loop. It may call functions in `own`; tasks that these cannot do are done by `general`, the inner loop for any
+    mechanism. `numbers`: data that generated functions read; `own_numbers`: data for those of collocation.
     """
 
     def __init__(

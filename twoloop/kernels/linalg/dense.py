@@ -185,7 +185,7 @@ def ldl_solve(A, x):
 
 @merged
 def ldl_solve_rows(A, B):
-    """Replace the right-hand sides, the columns of B, by the solutions, using the factors A from `ldl_factor`."""
+    """Solve for all columns of B by operations on its rows; solutions replace B. A: factors from `ldl_factor`."""
     n, m = B.shape
     for k in range(n):
         for i in range(k + 1, n):

@@ -338,11 +338,11 @@ def program_in_order(
 
 
 def _update_runs(targets: Integers, diagonal: NDArray[np.bool_]) -> Integers:
-    """Divide the updates of off-diagonal entries into runs; return the length and the first target of each run.
+    """Divide the updates of off-diagonal entries into ranges; return the length and the first target of each range.
 
-    A target is the slot of the entry that an update changes; targets are consecutive in a run. The rows of a joint are
-    adjacent in all columns, so that runs are long. So numbers are read and written as vectors, and the program is a
-    tenth as long as a list of all targets.
+    A target is the index of the entry that an update changes; within a range, targets are consecutive integers. Ranges
+    are long, because the rows of a joint are adjacent in all columns. So numbers are read and written as vectors, and
+    the program is a tenth as long as a list of all targets.
     """
     off_diagonal = np.flatnonzero(~diagonal)
     begins = np.flatnonzero(diagonal[off_diagonal - 1] | (targets[off_diagonal] != targets[off_diagonal - 1] + 1))
@@ -416,7 +416,7 @@ def factor_columns_of(program):
 
 @inlined
 def update_runs_of(program):
-    """Return length and first target of each run of updates (see `_update_runs`), in the order of elimination."""
+    """Return length and first target of each range of updates, see `_update_runs`, in the order of elimination."""
     begin = N_HEAD + 2 * program[N_PIVOTS] + 1 + program[N_OFF_DIAGONAL]
     return program[begin : begin + program[N_RUNS]]
 

@@ -15,9 +15,10 @@ converge. Then the dense matrix T^T (M - z^2 K - z D) T is factored, where the c
 newton_step.py, which solves all stages together, uses one set of derivatives for all stages. So newton_systems.py first
 multiplies derivatives by the inverse of T^T M T. For a matrix that is used in one iteration, this is twice the work.
 
-Under step-size control, a step of TR-BDF2 ends at the result of the embedded formula of order 3; the difference of the
-two formulas is filtered three times, which keeps the method L-stable. Then the errors of many short steps add up to the
-tolerance, not to the tolerance times the number of steps. `f` is the kit, and `w` the workspace.
+Under step-size control, a step of TR-BDF2 (order 2) ends close to the result of its embedded formula of order 3: the
+difference of both results is filtered, by (I - z J)^-1 with the Jacobian J, and then subtracted from the first. The
+filter keeps the method L-stable. The tolerance limits the difference, but the error of a step is smaller. So the errors
+of many short steps add up to about the tolerance, not to the tolerance times their number. `f`: kit, `w`: workspace.
 """
 
 import numpy as np
@@ -299,8 +300,8 @@ def solve_stage(f, w, options, memory, t, h, A_stage):
     return DONE
 
 
-# the difference between a step's formula and its embedded formula is filtered this number of times, then subtracted
-# from the end of the step. With fewer filters, the method is unstable for vibrations (tests/kernels/test_diagonal.py)
+# number of times that the difference between a step's result and that of its embedded formula is filtered before it is
+# subtracted. With fewer filters, the method is unstable for vibrations (tests/kernels/test_diagonal.py)
 N_FILTERS = 3
 
 # if the accelerations a_k of the stages jump once, |sum_k jump_weights[k] a_k| is at most this fraction of their range.

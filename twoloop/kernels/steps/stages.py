@@ -140,7 +140,7 @@ def estimate_end_error(tolerances, options, h, state, new_state, A_stage):
     N_REAL,  # number of real eigenvalues of the matrix A of the Butcher tableau
     N_PAIRS,  # number of pairs of conjugate complex eigenvalues of the matrix A of the Butcher tableau
     GAMMA0,  # first real eigenvalue of the tableau's A; if there is none, smallest magnitude of an eigenvalue
-    TESTS_VELOCITIES,  # 1: estimated velocity errors must be within tolerances; 0: results of `velocity_error` must be
+    TESTS_VELOCITIES,  # 1: limit the estimated velocity errors themselves; 0: limit their effects, see `velocity_error`
     N_EIGEN_SCALARS,
 ) = range(5)
 

@@ -53,15 +53,15 @@ from twoloop.kernels.linalg.saddle_point import solve_with_multipliers
 # indices of the arrays of an operation table (OperationGroups in twoloop.generate.series): its groups, and the first
 # arrays of the two lists of affine expressions (Sums) that are the arguments of its operations
 GROUPS, FIRST, SECOND, N_TABLE = 0, 1, 7, 13
-# indices of the arrays of a list of affine expressions, see Sums in twoloop.generate.series
+# arrays of a list of affine expressions, see Sums in twoloop.generate.series; MORE_...: terms after the first of each
 COLUMN, COEFFICIENT, CONSTANT, ROW, MORE_COLUMN, MORE_COEFFICIENT, N_SUMS = range(7)
-SUM_INDICES = N_SUMS  # index of a further array of such a list (of affine expressions): where their values are stored
+SUM_INDICES = N_SUMS  # one more array of such a list: index at which the value of each expression is stored
 # indices, among the arrays of the series program, of the first arrays of its four parts: tables of early and of late
 # operations; lists of expressions for the rows of G v + (C_t, b) = 0, and of Q - G^T lam - M a = 0
 EARLY, LATE, ROWS = 0, N_TABLE, 2 * N_TABLE
 BALANCE, N_ARRAYS = ROWS + N_SUMS + 1, ROWS + 2 * (N_SUMS + 1)
-# columns of GROUPS: kind of operation; then begin and end (indices) of the group's operations, of all terms of their
-# first arguments except the first term of each, and of those of their second arguments
+# columns of GROUPS. KIND: kind of operation. BEGIN, END: range of the group's operations. MORE_FIRST and next column:
+# range of the entries of MORE_COLUMN for their first arguments. MORE_SECOND and next: for their second arguments
 KIND, BEGIN, END, MORE_FIRST, _, MORE_SECOND, _, N_GROUP = range(8)
 
 # indices of the scalars in `memory`. Two series of q (ORDER + 1, n_q each) and the arrays of `array_views` follow.
@@ -86,7 +86,7 @@ KIND, BEGIN, END, MORE_FIRST, _, MORE_SECOND, _, N_GROUP = range(8)
 
 
 def memory_size(order: int, n_q: int, n_rows: int, n_nodes: int, early: int, late: int) -> int:
-    """Return the length of `memory`; n_rows: number of constraints; n_nodes, early, late: N_NODES, EARLY_WIDTH etc."""
+    """Return the length of `memory`; n_nodes, early, late: N_NODES, EARLY_WIDTH, LATE_WIDTH; n_rows: constraints."""
     n_orders = order + 2
     scratch = n_orders * (n_nodes + 2 * early + 2 * late) + early + late + n_q + n_rows
     return N_MEMORY_SCALARS + 2 * (order + 1) * n_q + scratch + n_q
@@ -371,11 +371,10 @@ def compute_coefficients(f, w, options, memory, t, state, unit):
     return finish_series(w, order, series)
 
 
-# step sizes are chosen so that, before the projection, the distance of a step's end from the constraints is about this
-# fraction of the allowed distance
+# aim of step sizes: distance of a step's end from the constraints before its projection, relative to that allowed
 TARGET_PREDICTION_ERROR = 0.3
-# near the beginning of a step, the series is exact, so that its defect there is a rounding error. A later defect counts
-# as a rounding error, too, if it is at most MAX_NOISE allowed defects and NOISE_RATIO times the defect at NEAR_BEGIN
+# near the beginning of a step (NEAR_BEGIN), the series is exact: its defect there is a rounding error. A later defect
+# counts as one, too, if it is at most MAX_NOISE * allowed defect, and at most NOISE_RATIO * defect near the beginning
 MAX_NOISE, NOISE_RATIO = 1e4, 10.0
 NEAR_BEGIN = 1e-5  # time after the beginning of a step, relative to the step size, at which the series is still exact
 # the defect is checked at equidistant times within a step. At each attempt, these times shift by this fraction of their
@@ -480,8 +479,8 @@ def _is_rounding_defect(f, w, memory, t, h, tolerances, series, order, q, v, a, 
 def _first_large_defect(f, w, memory, t, h, tolerances, series, order, q, v, a):
     """Return the first defect above 1 (relative to the allowed defect) within the step, or 0 if there is none.
 
-    The defect is evaluated at the time SUSPECT, and at times that differ from attempt to attempt. The time of a defect
-    above 1 becomes SUSPECT. w.defect becomes the largest of the other defects.
+    Evaluate it at SUSPECT, and at times that differ from attempt to attempt; skip rounding errors. The time of the
+    returned defect becomes SUSPECT unless SUSPECT is earlier. w.defect becomes the largest defect that is not returned.
     """
     max_gap, shift = tolerances[DEFECT_GAP], memory[ATTEMPTS] * GOLDEN_SECTION % 1.0
     n_points = 0

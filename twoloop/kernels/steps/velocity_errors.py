@@ -105,12 +105,12 @@ def _derivatives_may_matter(w, memory, tolerances, z, unfiltered, max_duration, 
 
 @compiled
 def derivatives_agree(f, w, options, memory, s, t, z, tolerances, unfiltered, e_q, e_v, state, new_state, a_end):
-    """Return True if the stored Jacobian J agrees with the equations at the end of a step, or cannot matter.
+    """Return True if J (stored Jacobian) agrees with the equations at the end of a step, or errors of J are harmless.
 
-    t, a_end: time, accelerations at this end. z: step size times a number. (e_q, e_v) is (I - z J)^-1 times an estimate
-    whose velocity part is `unfiltered` (n_dof each). So the velocity part of J (e_q, e_v) is (e_v - unfiltered) / z. It
-    is compared with the difference between the accelerations at the end of the step and at a state displaced from this
-    end by a multiple of (e_q, e_v).
+    t, a_end: time, accelerations at this end. z: step size times a coefficient of the method. (e_q, e_v) is equal to
+    (I - z J)^-1 u, where u is an error estimate with velocity part `unfiltered` (n_dof). So J (e_q, e_v) has the
+    velocity part (e_v - unfiltered) / z. This is compared with the difference between the accelerations at the end of
+    the step and at a state displaced from this end by a multiple of (e_q, e_v).
     """
     n = w.Q.size
     max_duration = max(motion_time(w, tolerances, state, state[2 * n :]), motion_time(w, tolerances, state, a_end))
