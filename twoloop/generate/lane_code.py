@@ -421,7 +421,7 @@ class LaneStages:
 
 
 class _Coordinate:
-    """Coordinate j in a loop over coordinates: its state before the step, its accelerations at `count` stages."""
+    """State before the step of coordinate j, in a loop over j, and its accelerations at the first `count` stages."""
 
     def __init__(self, stages: LaneStages, emit: LaneEmitter, memory: LaneMemory, j: Value, count: int):
         n, self.emit, self.new, self.n = stages.n, emit, emit.pointer(memory.new, j), stages.n

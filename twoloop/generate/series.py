@@ -66,7 +66,7 @@ class SeriesProgram:
     early : operations on quantities that depend on t and q only; after them, the products of entries of G with v.
     late : operations on quantities that depend on v, too; after them, the products of G^T lam + M a.
     rows, row_indices : G v + (C_t, b) without terms of the form "constant times v_i": nonzero rows, and their indices.
-    balance, balance_indices : the same for Q - G^T lam - M a without terms "constant times lam_i" or "... a_i".
+    balance, balance_indices : likewise Q - G^T lam - M a, without terms "constant times lam_i" or "constant times a_i".
     traced : traces of the callbacks, to be compared with calls; None: no comparison.
     """
 
@@ -249,7 +249,7 @@ def _assemble_program(
     row_products: dict[Any, Any],
     reaction_products: dict[Any, Any],
 ) -> SeriesProgram:
-    """Return the SeriesProgram for `rows`, G v + (C_t, b), and `balance`, Q - G^T lam - M a, given their products."""
+    """Return the SeriesProgram of two systems, G v + (C_t, b) = 0 (`rows`) and Q - G^T lam - M a = 0 (`balance`)."""
     early: list[Any] = []
     late: list[Any] = []
     factors = [expr for group in (row_products, reaction_products) for _, *exprs in group.values() for expr in exprs]
