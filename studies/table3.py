@@ -190,15 +190,8 @@ def short_tables(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, str]:
 
 def study_of(geometry: Geometry | None = None) -> Study:
     """Return the study, with the geometry that is assumed or with another."""
-    return Study(
-        "table3",
-        __doc__,
-        partial(make_short, geometry=geometry),
-        short_findings,
-        short_figures,
-        short_tables,
-        medians=True,
-    )
+    made = partial(make_short, geometry=geometry)
+    return Study("table3", __doc__, made, short_findings, short_figures, short_tables, medians=True)
 
 
 UNEQUAL = 1.2  # times of the same run, largest over least, beyond which they are no result
@@ -292,11 +285,8 @@ def causes(rows: pd.DataFrame) -> dict[str, Any]:
 TARGETS = (1e-2, 1e-4, 1e-6)
 PAPER = (NEWMARK, QUARTER, IRK_LINE)
 LOOPS = (1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10)  # err_out of Newmark
-EXPLICIT = (
-    solvers.OWN_EXPLICIT,
-    solvers.TAYLOR,
-    solvers.ADAMS,
-)  # all coordinates, projected: not the paper's procedure
+# all coordinates, projected: not the paper's procedure
+EXPLICIT = (solvers.OWN_EXPLICIT, solvers.TAYLOR, solvers.ADAMS)
 # for seconds: no quick runs
 COMPILED = (
     *(OWN_CODE, solvers.HEYOKA, solvers.CYRK, solvers.CVODE_C, solvers.IDA_INDEX_1, "IDA, stabilised"),

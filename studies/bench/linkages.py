@@ -6,7 +6,6 @@ Lagrange's equations. SciPy's DOP853 integrates both at 1e-13.
 
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
@@ -28,15 +27,6 @@ APART = 0.05  # m, least |shortest + longest - the others| of the first two kind
 CLOSE = (-8.0, -2.0)  # ... and the decades of those of the third
 NUDGE = 1e-7  # rad of the initial angle, by which the sensitivity of the end is found
 PLACES = np.array([0, 1, 3, 4, 6, 7])  # the coordinates that are lengths
-
-
-@dataclass(frozen=True)
-class Drawn:
-    """A linkage, its right state at the end, and how much an error at the start grows until then."""
-
-    problem: Problem
-    q: Array  # (9,); positions at the end, the angles counted from those of the start
-    sensitivity: float  # change of q over that of the initial angle of bar 3
 
 
 def four_lengths(kind: str, generator: np.random.Generator) -> Array:
@@ -62,8 +52,11 @@ def end_of(problem: Problem, t_end: float, theta3: float | None = None) -> Array
     return q[:, 1] + 2.0 * np.pi * turns
 
 
-def draw(kind: str, generator: np.random.Generator, t_end: float) -> Drawn | None:
-    """A linkage at rest in a random position; None where it cannot be assembled or its motion is not known."""
+def draw(kind: str, generator: np.random.Generator, t_end: float) -> tuple[Problem, Array, float] | None:
+    """Return a linkage at rest in a random position, its positions (9,) at the end, and the growth of an error.
+
+    None: it cannot be assembled, or its motion is not known. The growth is that of an error of the angle of bar 3.
+    """
     *bars, ground = four_lengths(kind, generator).tolist()
     theta3, branch = float(generator.uniform(-np.pi, np.pi)), int(generator.choice([-1, 1]))
     try:
@@ -71,7 +64,7 @@ def draw(kind: str, generator: np.random.Generator, t_end: float) -> Drawn | Non
         q, nudged = end_of(problem, t_end), end_of(problem, t_end, theta3 + NUDGE)
     except ValueError:
         return None
-    return Drawn(problem, q, float(np.abs(nudged - q).max()) / NUDGE)
+    return problem, q, float(np.abs(nudged - q).max()) / NUDGE
 
 
 MASS, INERTIA, GRAVITY = 1.0, 0.1, 9.81  # of each bar and of the slider

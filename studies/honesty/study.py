@@ -59,7 +59,8 @@ WITH_CODE: dict[str, dict[str, Any]] = {"": {}, "compiled": {"compiled": True}, 
 QUICK_OWN, QUICK_SCIPY = (GIVEN, "DOP853", "BDF"), ("DOP853",)
 OWN_OF = {  # groups of many runs, which fewer methods make
     **dict.fromkeys((traps.SINGULAR, traps.FOLD), (GIVEN, "auto, not compiled", "DOP853")),
-    **dict.fromkeys((traps.STOPS, traps.SIGNAL, traps.SHORT), (GIVEN, "DOP853", "RadauIIA5")),
+    **dict.fromkeys((traps.STOPS, traps.SIGNAL, traps.CALLS, traps.SHORT), (GIVEN, "DOP853", "RadauIIA5")),
+    traps.MANY: (GIVEN,),
     traps.INERTIA: (GIVEN, "auto, compiled", "DOP853", "Taylor", "RadauIIA5"),
     traps.CERTIFICATE: (GIVEN, "DOP853", "RadauIIA5", "BDF", "TRBDF2", "ESDIRK4", "Newmark"),
     traps.LINKAGE: (GIVEN, "DOP853"),
@@ -121,7 +122,14 @@ def solvers_of(quick: bool, group: str = traps.MISTAKE) -> dict[str, Call]:
         others = {name: solve for name, solve in others.items() if name in (IDA, IDA_C)}
     methods = QUICK_OWN if quick else OWN_OF.get(group, OWN)
     made: dict[str, Call] = {f"{name}{OWN_SUFFIX}": partial(own, name) for name in methods}
-    if group in (traps.STOPS, traps.INERTIA, traps.CERTIFICATE, traps.SIGNAL):  # of twoloop alone
+    if group in (
+        traps.MANY,
+        traps.STOPS,
+        traps.INERTIA,
+        traps.CERTIFICATE,
+        traps.SIGNAL,
+        traps.CALLS,
+    ):  # of twoloop alone
         return made
     made |= {name: partial(other, solve, False) for name, solve in others.items()}
     if group not in (traps.INPUT, traps.LINKAGE, traps.SINGULAR, traps.FOLD):  # which a largest step does not help
@@ -176,10 +184,12 @@ TABLE: dict[str, tuple[str, Callable[[pd.DataFrame], pd.Series]]] = {  # kinds o
     "pulse_short": ("pulses of 0.1 to 1 ms", _brief("pulse", True)),
     "singular": ("singular positions", _of(traps.SINGULAR)),
     "folds": ("folds of linkages", _of(traps.FOLD)),
+    "many": ("both from more starts and in larger sizes", _of(traps.MANY)),
     "stops": ("several stops", _of(traps.STOPS)),
     "inertia": ("little inertia", _of(traps.INERTIA)),
     "certificates": ("certificates", _of(traps.CERTIFICATE)),
     "signals": ("signals", _of(traps.SIGNAL)),
+    "calls": ("forces that depend on the number of calls", _of(traps.CALLS)),
     "linkages": ("random four-bar linkages", _of(traps.LINKAGE)),
     "mistakes": ("mistakes and hard motions", _of(traps.MISTAKE)),
     "input": ("inconsistent start, wrong derivative", _of(traps.INPUT)),
@@ -269,7 +279,7 @@ def answer_of(table: Mapping[str, Any]) -> str:
 
     brief = f"forces shorter than 1/{number(round(1.0 / LOOK))} of the run"
     words = {("sharp",): "runs under sharp forces", ("gust_short", "pulse_short"): f"under {brief}"}
-    words |= {("singular", "folds"): "at singular positions"}
+    words |= {("singular", "folds", "many"): "at singular positions"}
     places = [f"{counts(*keys)} {where}" for keys, where in words.items() if keys[0] in table]
     return f"{GIVEN[0].upper()}{GIVEN[1:]} is silently wrong in {', '.join(places)}."
 

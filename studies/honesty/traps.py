@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from decimal import Decimal, localcontext
 from functools import partial
-from itertools import chain, pairwise, product
+from itertools import chain, count, pairwise, product
 from types import SimpleNamespace
 from typing import Any
 
@@ -42,9 +42,11 @@ from twoloop.mechanisms import Problem, four_bar, n_four_bar
 NEVER = 1e30  # s
 # groups of traps: a start or a derivative that checks of the input find; a mistake in a model or a setting, or a hard
 # motion; a sharp force; a force so short that a solver may step over it; a random linkage; singular positions of A02,
-# and of linkages that fold; impacts at several stops; little inertia; certificates; exceptions of signal handlers
-GROUPS = INPUT, MISTAKE, FORCE, SHORT, LINKAGE, SINGULAR, FOLD, STOPS, INERTIA, CERTIFICATE, SIGNAL = (
-    *("input", "mistake", "force", "short", "linkage", "singular", "fold", "stops", "inertia", "certificate", "signal"),
+# and of linkages that fold; both again, from many starts and in large sizes; impacts at several stops; little inertia;
+# certificates; exceptions of signal handlers; forces that depend on the number of calls
+GROUPS = INPUT, MISTAKE, FORCE, SHORT, LINKAGE, SINGULAR, FOLD, MANY, STOPS, INERTIA, CERTIFICATE, SIGNAL, CALLS = (
+    *("input", "mistake", "force", "short", "linkage", "singular", "fold", "many folds", "stops", "inertia"),
+    *("certificate", "signal", "calls"),
 )
 AGREE = 1e-8  # m or rad: how far two methods may differ in the motion under a force
 SEED = 20261126  # of all draws: the day. Draw by a new seed when the methods have been changed to pass these
@@ -58,17 +60,16 @@ FORCES = (  # families of `sharp_forces`
 UNKNOWN_IN_SPACE = FORCES[-4:]  # two methods do not agree to AGREE there
 KINK = "drive with a kink"
 QUICK_FORCES = ("drag", "gust of 30 ms", KINK)
-SHAPES: dict[str, Callable[[float], Any]] = {
-    "gust": gust,
-    "pulse": pulse,
-}  # a gust exp(-(t / b)^2) has tails; a pulse is zero before and behind
+# a gust exp(-(t / b)^2) has tails; a pulse is zero before and behind
+SHAPES: dict[str, Callable[[float], Any]] = {"gust": gust, "pulse": pulse}
 WIDTHS = (1e-4, 3e-4, 1e-3, 3e-3, 1e-2)  # s: b of a gust, duration of a pulse
 N_DRAWS, N_QUICK, QUICK_WIDTHS = 8, 2, (1e-3,)  # of each width on each mechanism
 N_LINKAGES, LINKAGE_END = 100, 5.0  # of each kind; s
 SIZES, ENDS = tuple(range(1, 7)), (5.0, 10.0, 20.0)  # of A02 in both sets of coordinates; s
 TOLERANCES = tuple(10.0 ** (-0.5 * k) for k in range(12, 23))  # of A02: 1e-6 to 1e-11
 N_STARTS, FOLD_TOLERANCES = 5, tuple(10.0**-k for k in range(4, 12))  # of each linkage that folds
-N_BALLS, N_LONG, N_SIGNALS, LASTING = 4, 2, 4, 3.0  # draws of each kind; s
+MORE_STARTS, MORE_SIZES, LONGER = {"rhombus": 95}, (10, 20, 40), 100.0  # starts (else 20); sizes of A02; time limit, s
+N_BALLS, N_LONG, N_SIGNALS, N_CALLS, LASTING = 4, 2, 4, 5, 3.0  # draws of each kind; s
 STOP_TOLERANCES, INERTIA_TOLERANCES, CERTIFICATE_TOLERANCES = (1e-5, 1e-8, 1e-11), (1e-8, 1e-10), (1e-4, 1e-6, 1e-8)
 LEAST_IMPACTS, NUDGE = 15, 1e-9  # of balls; m/s, by which velocities are changed to see how errors grow
 LONG_BARS = ("parallelogram", "deltoid", *list(REGULAR)[:2])
@@ -159,10 +160,12 @@ def traps(quick: bool, groups: Sequence[str] | None = None) -> Iterator[Trap]:
         LINKAGE: lambda: random_linkages(0 if quick else N_LINKAGES),
         SINGULAR: lambda: iter(()) if quick else singular_positions(),
         FOLD: lambda: iter(()) if quick else folds(),
+        MANY: lambda: iter(()) if quick else many_folds(),
         STOPS: lambda: several_stops(1 if quick else N_BALLS),
         INERTIA: lambda: little_inertia(0 if quick else N_LONG),
         CERTIFICATE: lambda: iter(()) if quick else certificates(),
         SIGNAL: lambda: signals(1 if quick else N_SIGNALS),
+        CALLS: lambda: changing_forces(1 if quick else N_CALLS),
         FORCE: lambda: under_forces(quick),
         SHORT: lambda: short_forces(quick),
     }
@@ -187,9 +190,10 @@ def random_linkages(n: int) -> Iterator[Trap]:
         g, drawn, n_drawn = np.random.default_rng([SEED, place, k]), None, 0
         while drawn is None:
             drawn, n_drawn = draw(kind, g, LINKAGE_END), n_drawn + 1
-        trap = of_motion(kind, drawn.problem, lambda t, q=drawn.q: q)  # type: ignore[misc]
-        about: dict[str, Any] = {"mechanism": f"linkage {k}", "n_drawn": n_drawn, "group": LINKAGE}
-        yield replace(trap, t_end=LINKAGE_END, sensitivity=max(1.0, drawn.sensitivity), **about)
+        problem, q, growth = drawn
+        about: dict[str, Any] = {"mechanism": f"linkage {k}", "n_drawn": n_drawn, "sensitivity": max(1.0, growth)}
+        trap = of_motion(kind, problem, lambda t, q=q: q)  # type: ignore[misc]
+        yield replace(trap, t_end=LINKAGE_END, **about, group=LINKAGE)
 
 
 def singular_positions() -> Iterator[Trap]:
@@ -201,11 +205,23 @@ def singular_positions() -> Iterator[Trap]:
         yield replace(trap, t_end=t_end, tolerance=tolerance, mechanism=name, singular=True, group=SINGULAR)
 
 
-def folds() -> Iterator[Trap]:
-    """Yield linkages that fold on the way, from random starts, at FOLD_TOLERANCES."""
-    for (place, name), k, tolerance in product(enumerate(FOLDS), range(N_STARTS), FOLD_TOLERANCES):
-        known = moved(name, (SEED, place, k)) | {"mechanism": f"{name}, start {k}, {tolerance:g}", "error": None}
-        yield Trap("linkage that folds", **known, tolerance=tolerance, singular=True, group=FOLD)
+def folds(group: str = FOLD) -> Iterator[Trap]:
+    """Yield linkages that fold on the way, from N_STARTS random starts or from MANY more, at FOLD_TOLERANCES."""
+    for place, name in enumerate(FOLDS):
+        starts = range(N_STARTS) if group == FOLD else range(N_STARTS, N_STARTS + MORE_STARTS.get(name, 20))
+        for k, tolerance in product(starts, FOLD_TOLERANCES):
+            known = moved(name, (SEED, place, k)) | {"mechanism": f"{name}, start {k}, {tolerance:g}", "error": None}
+            yield Trap("linkage that folds", **known, tolerance=tolerance, singular=True, group=group)
+
+
+def many_folds() -> Iterator[Trap]:
+    """Yield linkages that fold from MORE_STARTS, and A02 in MORE_SIZES over its published time."""
+    yield from folds(MANY)
+    for coordinates, n, tolerance in product(("tips", "bodies"), MORE_SIZES, FOLD_TOLERANCES):
+        problem = n_four_bar(n, coordinates)
+        trap = of_motion(SINGULAR, problem, lambda t, known=problem.motion: known(t)[0])  # type: ignore[misc]
+        about: dict[str, Any] = {"tolerance": tolerance, "mechanism": f"{problem.name}, {tolerance:g}", "group": MANY}
+        yield replace(trap, t_end=problem.t_span[1], singular=True, time_limit=LONGER, **about)
 
 
 def several_stops(n: int) -> Iterator[Trap]:
@@ -291,12 +307,8 @@ def certificates() -> Iterator[Trap]:
     for (place, name), fault, tolerance in product(enumerate(REGULAR), FAULTS, CERTIFICATE_TOLERANCES):
         known, ran = moved(name, (SEED, place)), moved(name, (SEED, place), heavier=1.01)["system"]
         known |= {"error": None if fault == SOUND else lambda result: np.inf, "tolerance": tolerance}
-        known |= {
-            "mechanism": f"{name}, {tolerance:g}",
-            "solve": partial(solve, fault=fault, ran=ran),
-            "time_limit": 60.0,
-        }
-        yield Trap(fault, **known, group=CERTIFICATE)
+        known |= {"mechanism": f"{name}, {tolerance:g}", "solve": partial(solve, fault=fault, ran=ran)}
+        yield Trap(fault, **known, time_limit=60.0, group=CERTIFICATE)
 
 
 class Rung(ArithmeticError):
@@ -339,6 +351,29 @@ def signals(n: int) -> Iterator[Trap]:
         given = python_copy(problem.system) if plain else problem.system, problem.q0, problem.v0, LASTING
         place = f"four-bar{' of Python functions' * plain}, draw {k}"
         yield Trap(f"signal during {name}", place, *given, **about, error=lambda result: result.error)
+
+
+CHANGES: dict[str, Callable[[int, int, np.random.Generator], float]] = {  # of a force, by call, period and generator
+    "noise": lambda n, period, g: g.standard_normal(),
+    "counter": lambda n, period, g: 0.01 * n,
+    "every call another sign": lambda n, period, g: (-1.0) ** n,
+    "relay": lambda n, period, g: (-1.0) ** (n // period),
+    "some calls": lambda n, period, g: float(n % period == 0),
+}
+
+
+def changing_forces(n: int) -> Iterator[Trap]:
+    """Yield n draws of each kind of force that depends on the number of calls, on a four-bar."""
+    problem = four_bar()
+
+    def edit(change: Callable[..., float], g: np.random.Generator) -> Callable[..., Array]:
+        calls, size, period = count(1), 10.0 ** g.uniform(-2.0, 1.0), round(10.0 ** g.uniform(0.3, 2.0))
+        return lambda Q, *state: Q + size * change(next(calls), period, g)
+
+    for (place, (name, change)), k in product(enumerate(CHANGES.items()), range(n)):
+        changing = python_copy(problem.system, force=edit(change, np.random.default_rng([SEED, place, k])))
+        given = changing, problem.q0, problem.v0, LASTING
+        yield Trap(f"force that changes: {name}", f"four-bar, draw {k}", *given, group=CALLS)
 
 
 def of_motion(name: str, problem: Problem, positions: Callable[[float], Array]) -> Trap:
