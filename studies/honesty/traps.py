@@ -165,7 +165,7 @@ def traps(quick: bool, groups: Sequence[str] | None = None) -> Iterator[Trap]:
         INERTIA: lambda: little_inertia(0 if quick else N_LONG),
         CERTIFICATE: lambda: iter(()) if quick else certificates(),
         SIGNAL: lambda: signals(1 if quick else N_SIGNALS),
-        CALLS: lambda: changing_forces(1 if quick else N_CALLS),
+        CALLS: lambda: changing_torques(1 if quick else N_CALLS),
         FORCE: lambda: under_forces(quick),
         SHORT: lambda: short_forces(quick),
     }
@@ -362,18 +362,27 @@ CHANGES: dict[str, Callable[[int, int, np.random.Generator], float]] = {  # of a
 }
 
 
-def changing_forces(n: int) -> Iterator[Trap]:
-    """Yield n draws of each kind of force that depends on the number of calls, on a four-bar."""
-    problem = four_bar()
+def changing_torques(n: int) -> Iterator[Trap]:
+    """Yield n draws of each kind of torque that depends on the number of calls; `float` prevents that it is traced."""
 
-    def edit(change: Callable[..., float], g: np.random.Generator) -> Callable[..., Array]:
+    def turned(torque: Callable[..., Any]) -> Problem:
+        model = PlanarModel()
+        model.rod("rod", (0.0, 0.0), (1.0, 0.0), mass=1.0)
+        model.revolute("ground", "rod", at=(0.0, 0.0))
+        model.torque("rod", torque)
+        return model.problem((0.0, LASTING))
+
+    def torque(change: Callable[..., float], drag: Callable[[Any], Any], g: np.random.Generator) -> Callable[..., Any]:
         calls, size, period = count(1), 10.0 ** g.uniform(-2.0, 1.0), round(10.0 ** g.uniform(0.3, 2.0))
-        return lambda Q, *state: Q + size * change(next(calls), period, g)
+        return lambda t, q, v: size * change(next(calls), period, g) - 0.1 * drag(v[2])
 
-    for (place, (name, change)), k in product(enumerate(CHANGES.items()), range(n)):
-        changing = python_copy(problem.system, force=edit(change, np.random.default_rng([SEED, place, k])))
-        given = changing, problem.q0, problem.v0, LASTING
-        yield Trap(f"force that changes: {name}", f"four-bar, draw {k}", *given, group=CALLS)
+    still = turned(lambda t, q, v: 0.0)
+    for (kind, (name, change)), python, k in product(enumerate(CHANGES.items()), (True, False), range(n)):
+        changing = torque(change, float if python else np.positive, np.random.default_rng([SEED, kind, python, k]))
+        solve = lambda system, *run, f=changing, **options: solve_dae(turned(f).system, *run, **options)  # noqa: E731
+        given = still.system, still.q0, still.v0, LASTING
+        place = f"pendulum, {'Python' if python else 'traced'}, draw {k}"
+        yield Trap(f"torque that changes: {name}", place, *given, solve=solve, group=CALLS)
 
 
 def of_motion(name: str, problem: Problem, positions: Callable[[float], Array]) -> Trap:

@@ -24,6 +24,8 @@ from twoloop.problem.system import ConstrainedSystem
 STEPS = 50  # largest number of iterations; Newton's method needs three or four
 CONVERGED = 1e-14  # relative change of the friction in an iteration that counts as convergence
 DEPENDENT = 1e-12  # singular values of the constraint rows below this fraction of the largest count as zero
+# comparisons of a traced function with calls are repeated so often at the start: it may change after a number of calls
+N_REPEATED = 120
 
 
 class LoadedFriction:
@@ -139,14 +141,8 @@ def system_of(
     kinds += ["nonholonomic", "nonholonomic_gamma"] if tables.n_rates else []
     if any(isinstance(motion, Function) for motion in tables.motions):
         kinds.append("constraint_rate")
-    options: Any = {
-        "n_q": n_q,
-        "n_c": tables.n_rows,
-        "n_a": tables.n_rates,
-        "joints": joints,
-        "name": name,
-        "parameters": tables.p,
-    }
+    options: Any = {"n_q": n_q, "n_c": tables.n_rows, "n_a": tables.n_rates}
+    options |= {"joints": joints, "name": name, "parameters": tables.p}
     _check_functions(tables, *start)
     if not tables.untraced:
         tables.untraced = _disagreement(tables, *start)
@@ -271,7 +267,7 @@ def _disagreement(tables: Tables, t: float, q: Array, v: Array) -> str:
         (tables.motions, head[layout.MOTION_PROGRAM]),
         (tables.functions, head[layout.FORCE_PROGRAM]),
     ):
-        for number in range(N_COMPARED if functions else 0):
+        for number in (*range(N_COMPARED), *[0] * N_REPEATED) if functions else ():
             offset = generic.uniform(-1.0, 1.0, (2, len(q))) * (number > 0)
             time = t + TIME_SPACING * number
             near_q, near_v = q + 0.3 * offset[0], v + offset[1]
