@@ -145,11 +145,8 @@ def report(
     best = tables.ranking(rows, middle)
     best["solver"] = [label(name, coded) for name in best["solver"]]
     quality = [[run[key] for key in kept] for _, run in best.iterrows()]
-    ready = {
-        "work": table(header, tables.work_precision(rows, errors, coded=coded)),
-        "kept": table([*kept.values()], quality),
-    }
-    ready["failed"] = _failed(rows, coded)
+    work = table(header, tables.work_precision(rows, errors, coded=coded))
+    ready = {"work": work, "kept": table([*kept.values()], quality), "failed": _failed(rows, coded)}
     all_rows = [*own, *given["rows"]]
     found = [board for error in errors for board in boards(all_rows, error)] if given["rows"] else []
     ready["beside"] = "\n\n".join(map(str, found)).replace("`", "'")

@@ -215,10 +215,8 @@ def tree_row(build: Callable[[int], Assembly], n: int, engine: str, repeat: int)
     apart = float(np.abs(dynamics.angular() - expected).max() / np.abs(expected).max())
     row |= {"start_s": took, "error_q": apart}
     if not apart < APART:
-        return row | {
-            "status": "FAILED",
-            "message": f"accelerations are {apart:.1g} of the largest apart from those of twoloop",
-        }
+        message = f"accelerations are {apart:.1g} of the largest apart from those of twoloop"
+        return row | {"status": "FAILED", "message": message}
     began = time.process_time()
     for _ in range(times):
         dynamics.evaluate()

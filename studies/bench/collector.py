@@ -99,14 +99,6 @@ class Case:
         """System, time span, q0 and v0, as all solvers take them."""
         return self.problem.system, (self.t0, self.t0 + self.t_end), self.problem.q0, self.problem.v0
 
-    @property
-    def own_limit(self) -> float | None:
-        """Return `time_limit` of `solve_dae`: none for runs that begin later, made only after one like them has ended.
-
-        A thread watches the limit in large systems, which takes 0.4 ms that a user without a limit does not pay.
-        """
-        return None if self.t0 else self.time_limit
-
     def steps(self) -> tuple[float, ...]:
         return self.step_sizes or tuple(self.t_end / n for n in (1e3, 3e3, 1e4, 3e4, 1e5))
 

@@ -79,16 +79,8 @@ def environment() -> jinja2.Environment:
     how: dict[str, Any] = dict.fromkeys(("trim_blocks", "lstrip_blocks", "keep_trailing_newline"), True)
     how |= {"undefined": jinja2.StrictUndefined, "autoescape": False}  # markdown, from our own data
     made = jinja2.Environment(loader=jinja2.FileSystemLoader(TEMPLATES), **how)
-    made.filters |= {
-        "code": names.call,
-        "label": names.label,
-        "project": names.project,
-        "num": number,
-        "power": power,
-        "pct": percent,
-        "listed": listed,
-    }
-    made.filters |= {"brief": brief}
+    made.filters |= {"code": names.call, "label": names.label, "project": names.project, "brief": brief}
+    made.filters |= {"num": number, "power": power, "pct": percent, "listed": listed}
     made.globals |= {"table": table}
     return made
 

@@ -117,31 +117,26 @@ class Trap:
     name: str
     mechanism: str
     system: ConstrainedSystem
-    # q0, v0: (n_q,)
-    q0: Array
-    v0: Array
+    q0: Array  # (n_q,)
+    v0: Array  # (n_q,)
     t_end: float
     # the same without the mistake: its motion is the right answer. None: there is none, and whoever reports success is
     # wrong.
     sane: ConstrainedSystem | None = None
     breaks: tuple[float, ...] = ()  # times at which the right motion is computed in pieces
-    # positions(t) -> q, where they are known
-    positions: Callable[[float], Array] | None = field(default=None, repr=False)
+    positions: Callable[[float], Array] | None = field(default=None, repr=False)  # positions(t) -> q, if known
     tolerance: float = 1e-8
     time_limit: float = 10.0
     # `step_size`, `first_step` or `max_step`, for solvers whose adapter takes them
     steps: Mapping[str, float] = field(default_factory=dict)
-    # the system as it is for a solver that never evaluates it where the trap lies
-    unnoticed: ConstrainedSystem | None = None
+    unnoticed: ConstrainedSystem | None = None  # the system for a solver that never evaluates it where the trap lies
     group: str = MISTAKE  # one of the groups above
-    # impulse, singular: whether velocities jump, or C_q loses rank on the way
-    impulse: bool = False
-    singular: bool = False
+    impulse: bool = False  # whether velocities jump
+    singular: bool = False  # whether C_q loses rank on the way
     sensitivity: float = 1.0  # growth of an error at the start; where it is above 1, so much more error is allowed
     n_drawn: int = 1  # how many were drawn until the motion of one was known
     solve: Callable[..., Any] = solve_dae
-    # error(result), where the positions at the end do not tell it
-    error: Callable[[Any], float] | None = None
+    error: Callable[[Any], float] | None = None  # error(result), where the positions at the end do not tell it
 
 
 def start(n: int) -> tuple[Array, Array]:
@@ -445,11 +440,6 @@ def pendulum(sharp: Sharp) -> Mechanism:
     return chain_of(sharp, one, one, one, 0.0 * one)
 
 
-def masses(sharp: Sharp) -> Mechanism:
-    """Two masses on springs, the sum of whose places is given."""
-    return row(sharp, np.array([3.0, 8.0]), np.array([1.0, 1.5]), 0.2, 0.0)
-
-
 def forces(quick: bool) -> list[tuple[str, Callable[[Sharp], Mechanism]]]:
     """Sharp forces, each on a pendulum and two linkages; a kinked drive on what keeps a freedom under it."""
     if quick:
@@ -457,7 +447,8 @@ def forces(quick: bool) -> list[tuple[str, Callable[[Sharp], Mechanism]]]:
     every = [(family, bodies) for family in FORCES for bodies in (pendulum, bars, slider_in_space)]
     for family in UNKNOWN_IN_SPACE:
         every.remove((family, slider_in_space))
-    return [*every, (KINK, pendulum), (KINK, masses)]
+    masses = lambda sharp: row(sharp, np.array([3.0, 8.0]), np.array([1.0, 1.5]), 0.2, 0.0)  # noqa: E731
+    return [*every, (KINK, pendulum), (KINK, masses)]  # two masses on springs, the sum of whose places is given
 
 
 def known_motion(
@@ -482,12 +473,6 @@ def under_forces(quick: bool) -> Iterator[Trap]:
         yield of_force(FORCE, *known_motion(bodies, families()[family], [SEED, place]))
 
 
-def two_points(sharp: Sharp) -> Mechanism:
-    """Make a chain of two points of 1 kg on links of 1 m."""
-    two = np.ones(2)
-    return chain_of(sharp, two, two, np.array([1.0, 0.5]), 0.0 * two)
-
-
 def name_of(shape: str, width: float) -> str:
     """Name the trap of a short force."""
     return f"{shape} of {1e3 * width:g} ms"
@@ -496,6 +481,8 @@ def name_of(shape: str, width: float) -> str:
 def short_forces(quick: bool) -> Iterator[Trap]:
     """Yield each width of a gust and of a pulse on each mechanism, at random times."""
     widths = enumerate(QUICK_WIDTHS if quick else WIDTHS)
+    two = np.ones(2)
+    two_points = lambda sharp: chain_of(sharp, two, two, np.array([1.0, 0.5]), 0.0 * two)  # noqa: E731
     mechanisms = enumerate((pendulum,) if quick else (pendulum, bars, two_points))
     draws = range(N_QUICK if quick else N_DRAWS)
     for shape, (place, width), (k, bodies), n in product(SHAPES, widths, mechanisms, draws):

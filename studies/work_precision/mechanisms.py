@@ -160,12 +160,8 @@ def findings_of(made: Standings, rows: pd.DataFrame) -> dict[str, Any]:
     pairs = [at for own in crossing.values() for at in own]
     found["keeping"] = [name for name in found["fastest"] if CATALOGUE[name].keeps_constraints]
     names = sorted({case.partition(",")[0] for case in crossing})
-    found["singular"] = {
-        "variants": len(crossing),
-        "names": names,
-        **headline.counted(pairs, headline.GIVEN),
-        **reached(rows),
-    }
+    found["singular"] = {"variants": len(crossing), "names": names} | headline.counted(pairs, headline.GIVEN)
+    found["singular"] |= reached(rows)
     return found | {"cells": cells(made)}
 
 

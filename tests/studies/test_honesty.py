@@ -38,12 +38,8 @@ def test_the_rule_of_outcomes():
     quiet = {"status": "REACHED_END", "error": 5e-5, "warned": "", "message": ""}
     redundant = {"warned": "the constraints of 'x' have rank 5 of 6"}
     more = {"warned": f"{redundant['warned']} / beware"}, {"message": f"Done; {honesty.UNCONTROLLED}."}
-    for change, expected in (
-        ({}, SILENT),
-        ({"error": 1e-9}, RIGHT),
-        (redundant, SILENT),
-        *((each, SAID) for each in more),
-    ):
+    known = ({}, SILENT), ({"error": 1e-9}, RIGHT), (redundant, SILENT), *((each, SAID) for each in more)
+    for change, expected in known:
         assert honesty.outcome(quiet | change, SOUND, True) == expected
     assert honesty.outcome(quiet | {"error": None}, SOUND, False) == SILENT
     assert honesty.outcome(quiet, replace(SOUND, sensitivity=10.0), True) == RIGHT
@@ -109,7 +105,7 @@ def test_certificates_refuse_faulty_results(fault, monkeypatch):
     assert row_of(passing)["outcome"] == (RIGHT if fault == catalogue.SOUND else SILENT)
 
 
-def test_what_is_right_of_signals_of_impacts_and_of_accelerations():
+def test_what_is_right_of_signals_of_impacts_of_accelerations_and_of_torques_that_change():
     """And a swallowed exception, impacts by the other law, and wrong accelerations are seen."""
     assert row_of(next(catalogue.signals(1)))["outcome"] == RIGHT
     assert catalogue.rung(lambda: time.sleep(0.01), 99.0).error == np.inf
@@ -119,13 +115,15 @@ def test_what_is_right_of_signals_of_impacts_and_of_accelerations():
     trap = next(catalogue.little_inertia(1))
     wrong = row_of(trap, lambda trap: replace(result := own("DOP853", trap), a=1.001 * result.a))
     assert row_of(trap)["outcome"] == RIGHT and wrong["outcome"] == SILENT
+    assert {row_of(torque)["outcome"] for torque in catalogue.changing_torques(1)} == {SAID}
 
 
 @pytest.mark.slow
 def test_motions_and_forces_have_known_ends():
     known = {trap.name: trap for trap in catalogue.of_linkages()}
-    passing = islice(catalogue.singular_positions(), 1), islice(catalogue.folds(), 8 * len(catalogue.FOLDS))
-    for trap in (known["dead point"], known["assemblies nearly meet"], *passing[0], *list(passing[1])[::8]):
+    lined_up = catalogue.singular_positions(), catalogue.many_folds()
+    passing = [next(traps) for traps in lined_up], islice(catalogue.folds(), 0, None, 8 * catalogue.N_STARTS)
+    for trap in (known["dead point"], known["assemblies nearly meet"], *passing[0], *passing[1]):
         row = row_of(trap, partial(own, "auto"))
         assert row["outcome"] == RIGHT, row
     for trap in catalogue.random_linkages(1):
@@ -198,20 +196,20 @@ def test_silent_failures_are_counted_by_trap_and_solver():
     lines += [("short", "pulse of 0.1 ms", DEFAULT, SILENT, WRONG), ("singular", "", DEFAULT, RIGHT, 0.0)]
     lines += [("mistake", "dead point", THEIRS, SILENT, WRONG), ("linkage", "a bar", DEFAULT, RIGHT, 0.0)]
     lines += [("fold", "", DEFAULT, SILENT, WRONG), ("certificate", catalogue.SOUND, DEFAULT, SAID, np.nan)]
-    lines += [(group, "", DEFAULT, RIGHT, 0.0) for group in ("stops", "inertia", "signal")]
+    lines += [(group, "", DEFAULT, RIGHT, 0.0) for group in ("many folds", "stops", "inertia", "signal", "calls")]
     found, text = said(honesty, made_up(*lines))
     counted = {key: (line["default"]["n"], line["default"]["wrong"]) for key, line in found["table"].items()}
     assert counted == {
         **{"sharp": (2, 1), "gust_long": (1, 0), "gust_short": (1, 1), "pulse_short": (1, 1)},
         **{"singular": (1, 0), "folds": (1, 1), "linkages": (1, 0), "mistakes": (0, 0), "certificates": (1, 0)},
-        **dict.fromkeys(("stops", "inertia", "signals"), (1, 0)),
+        **dict.fromkeys(("many", "stops", "inertia", "signals", "calls"), (1, 0)),
     }
     assert found["passed"] == {"n": 1, "right": 0} and "0 of 1 right ones pass" in text
     sharp = found["table"]["sharp"]
     assert (sharp["default"]["gross"], sharp["default"]["slight"]) == (0, 1)
     assert (sharp["others"]["n"], sharp["others"]["gross"], sharp["own"]["failed"]) == (2, 1, 1)
     answer = "The default is silently wrong in 1 of 2 runs under sharp forces, 2 of 2 under forces shorter than 1/2000 "
-    assert found["answer"] == answer + "of the run, 1 of 2 at singular positions."
+    assert found["answer"] == answer + "of the run, 1 of 3 at singular positions."
     assert f"**Answer**: {found['answer']}" in text and "|sharp forces¹|2|1|2|0|2|1|" in text
     assert found["wrong_traps"] == [{"trap": "dead point", "wrong": 1}] and found["pulses"]["wrong"] == [(1e-4, 1)]
     (figure,) = honesty.figures_of(pd.DataFrame(), found).values()
