@@ -35,8 +35,8 @@ def test_other_threads_run_beside_the_compiled_integrator():
         counted += 1
         time.sleep(0.0)
     thread.join()
-    # with the lock held, this thread would run between chunks only, a few dozen times
-    assert runs[0].success and counted > 1000
+    # with the lock held, this thread would run between chunks only, about ten times; without it, thousands of times
+    assert runs[0].success and counted > 100
 
 
 def test_a_time_limit_keeps_what_there_is():
