@@ -20,6 +20,8 @@ be checked between them. The ends of steps in a row are projected onto the const
 
 import math
 
+import numpy as np
+
 from twoloop.kernels.control import loop_state as at
 from twoloop.kernels.control.singular_positions import COLLAPSED_STEP, SHORT_STEP, SINGULAR_PIVOT
 from twoloop.kernels.control.step_size import count_step, prediction_error, size_off_grid, store_prediction
@@ -330,7 +332,7 @@ def _take_steps(f, w, options, data, tolerances, control, clock, goal, state, n_
         if result == NOT_COMPUTED:
             break
         if result != CONVERGED:
-            clock[at.H_NEXT] = h * factor
+            clock[at.H_NEXT] = h * factor if result == GUESSED else min(h * factor, h - np.spacing(abs(t + h)))
             w.n_rejected_error += 1 if result == REJECTED else 0
             continue
         f.end_nodes(data, state, state)
