@@ -11,17 +11,7 @@ from typing import Any
 import numpy as np
 
 from references.driver import STORED
-from references.exudyn.model import (
-    GROUND,
-    PRISMATIC,
-    REVOLUTE,
-    SPHERICAL,
-    UNIVERSAL,
-    Model,
-    check_steps,
-    frame,
-    run,
-)
+from references.exudyn.model import GROUND, PRISMATIC, REVOLUTE, SPHERICAL, UNIVERSAL, Model, check_steps, frame, run
 from references.lines import CannotRun, Line
 from twoloop.bodies.rotation import euler_parameters, rotated_rate, rotation_matrix
 from twoloop.mechanisms import bricard, n_four_bar

@@ -1,10 +1,6 @@
 """Evaluate callbacks of models in which motions, rows or forces are functions, traced to programs stored in p."""
 
-from twoloop.bodies.callbacks import (
-    fill_rows,
-    fill_values,
-    motion_results,
-)
+from twoloop.bodies.callbacks import fill_rows, fill_values, motion_results
 from twoloop.bodies.forces import fill_force, force_results
 from twoloop.bodies.read_tables import fill_nonholonomic, fill_nonholonomic_gamma
 from twoloop.kernels.compile.callbacks import callback

@@ -108,9 +108,7 @@ class Violation:
         """Measure the violation of C(t, q) = 0 at a position."""
         values, size = system.constraint(t, q), np.abs(q)
 
-        def change(
-            neighbour: Array,
-        ) -> Array:  # its rounding shows whether C is a difference of large terms
+        def change(neighbour: Array) -> Array:  # its rounding shows whether C is a difference of large terms
             return system.constraint(t, neighbour) - values - jacobian @ (neighbour - q)
 
         noise = _noise(q, change, jacobian, float(size.max(initial=0.0)))

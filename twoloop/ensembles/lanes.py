@@ -293,15 +293,7 @@ class LaneRuns:
         return status, n_steps, n_evaluations, ends
 
     def find_valid_runs(
-        self,
-        numbers: Integers,
-        status: Integers,
-        t1: float,
-        rtol: float,
-        atol: float,
-        q: Array,
-        v: Array,
-        ends: Array,
+        self, numbers: Integers, status: Integers, t1: float, rtol: float, atol: float, q: Array, v: Array, ends: Array
     ) -> Flags:
         """Return a mask of the runs that have all states and satisfy the callbacks; set the status of the others.
 

@@ -602,9 +602,7 @@ class CollocationCode:
             weight = emit.broadcast(num.load(num.pointer(work, i), mem.WEIGHTS))
             carried.append(emit.maximum(abs(errors) * weight, max_error))
             store_lanes(
-                emit,
-                self._weighted_accelerations(emit, tables().end, a0, work, i),
-                num.pointer(new, k * LANES),
+                emit, self._weighted_accelerations(emit, tables().end, a0, work, i), num.pointer(new, k * LANES)
             )
         self._choose_degree(emit, work, carried[0])
         if self.other_coordinates:

@@ -92,10 +92,7 @@ class LaneSteps:
         select, unit = emit.builder.select, emit.load(work, lanes.UNIT)
         is_fresh, is_accepted = (is_set(emit, work, field) for field in (lanes.IS_NEW, lanes.ACCEPTED))
         duration = broadcast_entry(emit, control, lanes.T1) - broadcast_entry(emit, control, lanes.T0)
-        next_unit = emit.minimum(
-            emit.load(work, lanes.LENGTH) * unit,
-            MAX_FACTOR * emit.load(work, lanes.H),
-        )
+        next_unit = emit.minimum(emit.load(work, lanes.LENGTH) * unit, MAX_FACTOR * emit.load(work, lanes.H))
         first_unit = FIRST_UNIT * duration
         unit = select(is_fresh, first_unit, select(is_accepted, next_unit, unit))
         emit.store(unit, work, lanes.UNIT)
@@ -111,10 +108,7 @@ class LaneSteps:
         scales = []
         for j in range(n):
             q, v = (abs(emit.load(memory.series, i)) for i in (j, n + j))
-            of_q, of_v = (
-                atol[j] + rtol * q,
-                atol[j] * unit + rtol * v,
-            )
+            of_q, of_v = atol[j] + rtol * q, atol[j] * unit + rtol * v
             scales.append(one / emit.minimum(of_q, of_v / emit.to_double(order)))
         for back in (0, 1):
             power = order - back
@@ -215,10 +209,7 @@ class LaneSteps:
         for j in range(n):
             distance = emit.maximum(h * magnitude(memory.state, n + j), difference(memory.new, memory.state, j))
             motion = emit.maximum(distance, motion)
-        is_passage, least = (
-            self.crossing_mask(emit, memory),
-            FRACTION_AT_SIGN_CHANGE * motion,
-        )
+        is_passage, least = self.crossing_mask(emit, memory), FRACTION_AT_SIGN_CHANGE * motion
         motion = FRACTION_OF_MOTION * motion
         for j in range(n):
             scale = atol[j] + rtol * emit.maximum(magnitude(memory.new, j), magnitude(memory.state, j))

@@ -13,13 +13,7 @@ from twoloop.bodies.frames import vector_of
 from twoloop.bodies.functions import Function, RateFunction
 from twoloop.bodies.loads import Row, listed
 from twoloop.bodies.model_problem import Model
-from twoloop.bodies.parameter_layout import (
-    ACROSS,
-    ANGLE,
-    POINT,
-    RATE_FUNCTION,
-    TORSION_SPRING,
-)
+from twoloop.bodies.parameter_layout import ACROSS, ANGLE, POINT, RATE_FUNCTION, TORSION_SPRING
 from twoloop.bodies.parts import Body, Force, JointRow, ModelJoint, Numbers
 from twoloop.checks.arguments import Array, check_finite, check_positive, check_vector
 

@@ -12,13 +12,7 @@ from numpy.typing import ArrayLike
 from twoloop.bodies.collection import Points, add, documented
 from twoloop.bodies.functions import Function
 from twoloop.bodies.loads import function_rows
-from twoloop.bodies.parameter_layout import (
-    ALONG,
-    ANGLE_DRIVE,
-    PERPENDICULAR,
-    POINT,
-    TORSION_SPRING,
-)
+from twoloop.bodies.parameter_layout import ALONG, ANGLE_DRIVE, PERPENDICULAR, POINT, TORSION_SPRING
 from twoloop.bodies.parts import Body, Force, JointRow, ModelJoint, Numbers
 from twoloop.bodies.rotation import euler_parameters, perpendiculars, rotation_matrix
 from twoloop.bodies.spatial.couplings import SpatialCouplings, relative
