@@ -2,9 +2,9 @@
 
 The method integrates the independent positions and velocities (q_i, v_i). The first stage is the state at the beginning
 of the step, and two embedded formulas estimate the error. By default, the inner loop computes the dependent coordinates
-of every stage, so that all stages satisfy the constraints. With FREE = 1, unlike in the paper, the method integrates
-dependent coordinates, too: stages violate the constraints slightly, and only the end of the step is projected. `f`
-is the kit, and `w` the workspace.
+of every stage, so that all stages satisfy the constraints. With options[FREE] = 1, unlike in the paper, the method
+integrates dependent coordinates, too: stages violate the constraints slightly, and only the end of the step is
+projected. `f` is the kit (functions of the system), and `w` the workspace (arrays that kernels write).
 """
 
 import numpy as np
@@ -16,14 +16,16 @@ from twoloop.kernels.data.indices import ATOL, DONE, ESTIMATE, LEAST, RTOL
 from twoloop.kernels.evaluation.inner_loop import evaluate, evaluate_state, evaluate_without_projection, project
 from twoloop.kernels.linalg.dense import copy, sum_rows
 
-# indices of the scalars in `options`, see the arguments of options_array. FREE: 1 if stages are not projected. The
-# tableau A (s, s), b (s), c (s) and the weights of the two error estimates (s each) follow
+# indices of the scalars in the array `options`: number of stages s; tolerance of the inner loop; 1 if stages are not
+# projected onto the constraints, else 0; limit of the last correction of a converged projection. After the scalars,
+# the array contains the Butcher tableau A (s, s), b (s), c (s) and the weights of the two error estimates (s each)
 STAGES, INNER_TOL, FREE, THETA, N_SCALARS = range(5)
-# indices of vectors in `memory`; derivatives [v, a] of the s stages follow. All have 2 n_q numbers, and are padded
+# indices of vectors in the array `memory`: state [q, v] of a stage; fine and coarse estimate of the errors of [q, v].
+# Then follow the derivatives [v, a] of the s stages. Each vector has 2 n_q numbers, and is padded (see BLOCK_SIZE)
 STAGE_STATE, FINE_ERROR, COARSE_ERROR, N_VECTORS = range(4)
 BLOCK_SIZE = 8  # vectors are padded to a multiple of this size, so that loops over them have no remainder
-# STRICT: factor on the error estimate once a run has come near a singular position, because phase errors grow at each
-# such position. The factor decreases to 1 as the smallest tolerance falls from STRICT * LEAST_STRICT to LEAST_STRICT
+# once a run has come near a singular position, error estimates are multiplied by STRICT, because phase errors grow at
+# each such position. For tolerances below STRICT * LEAST_STRICT the factor is smaller; it is 1 below LEAST_STRICT
 STRICT, LEAST_STRICT = 10.0, 1e-11
 
 
@@ -37,10 +39,10 @@ def options_array(
     free: bool = False,
     theta: float = 0.0,
 ) -> NDArray[np.float64]:
-    """Return the array `options` of `explicit_step` for the tableau A (s, s), b (s), c (s).
+    """Return the array `options` of `explicit_step` for the Butcher tableau A (s, s), b (s), c (s) of s stages.
 
-    `fine`, `coarse`: weights (s) of the two error estimates; `free`: stages are not projected; `theta`: a projection
-    has converged if its last correction is at most this.
+    `fine`, `coarse`: weights (s) of the two error estimates. `inner_tol`: tolerance of the inner loop. `free`: whether
+    stages are not projected. `theta`: a projection has converged if its last correction is at most this.
     """
     A, b, c, fine, coarse = (np.asarray(x, dtype=float) for x in (A, b, c, fine, coarse))
     s = b.size
@@ -53,7 +55,7 @@ def options_array(
 
 
 def memory_size(s: int, n_q: int) -> int:
-    """Return the length of `memory` for s stages and n_q coordinates."""
+    """Return the length of `memory`, the work array of `explicit_step`, for s stages and n_q coordinates."""
     return (N_VECTORS + s) * (-(-2 * n_q // BLOCK_SIZE) * BLOCK_SIZE)
 
 
@@ -80,7 +82,7 @@ def _vector_view(memory, n, index):
 
 @compiled
 def _add_weighted_slopes(y, h, weights, slopes, total, y1):
-    """Set y1 to y + h * sum_k weights[k] * slopes[k]; y is added last to reduce rounding errors; `total` is scratch."""
+    """Set y1 to y + h * (sum of weights[k] * slopes[k]); the sum is computed first, in `total`, to reduce rounding."""
     sum_rows(weights, slopes, total)
     for m in range(y.size):
         y1[m] = y[m] + h * total[m]
@@ -114,7 +116,7 @@ def largest_error(tolerances, y, y1, fine_error, coarse_error, strict):
 
 @compiled
 def _estimate_error(tolerances, h, fine, coarse, y, y1, slopes, fine_error, coarse_error, strict):
-    """Return the estimated error of a step from y to y1, in tolerances; fill `fine_error` and `coarse_error`."""
+    """Store h times the `fine` and `coarse` weighted sums of `slopes`; return the `largest_error` from these two."""
     sum_rows(fine, slopes, fine_error)
     sum_rows(coarse, slopes, coarse_error)
     for m in range(y.size):
@@ -125,7 +127,7 @@ def _estimate_error(tolerances, h, fine, coarse, y, y1, slopes, fine_error, coar
 
 @kernel(ATTEMPT, vectorized=True)
 def explicit_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """Attempt a step of size h; if its estimated error is above 1, do not compute the accelerations at its end."""
+    """Attempt a step of size h; reject it before its end is projected if the estimated error exceeds the tolerance."""
     s, A, b, c, fine, coarse = tableau_of(options)
     n = w.Q.size
     q, v, y, y1 = state[:n], state[n : 2 * n], state[: 2 * n], new_state[: 2 * n]
@@ -147,7 +149,7 @@ def explicit_step(f, w, options, memory, t, h, tolerances, state, new_state):
     w.n_outer += 1
     copy(state[n : 3 * n], slopes[0])
     for j in range(1, s):
-        _add_weighted_slopes(y, h, A[j, :j], slopes, stage, stage)  # for dependent coordinates, first guesses
+        _add_weighted_slopes(y, h, A[j, :j], slopes, stage, stage)  # first guesses of dependent coordinates
         v_stage, a_stage = slopes[j, :n], slopes[j, n : 2 * n]
         copy(stage[n : 2 * n], v_stage)
         if is_free:

@@ -48,37 +48,37 @@ from twoloop.kernels.linalg.dense import copy
 # indices in `options`
 (
     THETA,  # a projection has converged if its last correction is at most this, see `project`
-    N_ITERATED,  # number of coordinates on which accelerations depend; only these coordinates are iterated
+    N_ITERATED,  # number of coordinates on which accelerations depend; only these change in the fixed-point iteration
     N_ROWS,  # number of constraints
-    FREE,  # in steps longer than FREE * allowed time between evaluations, the defect is also evaluated between nodes
-    MAY_REPEAT,  # 1: a sweep may evaluate accelerations twice; 0: once, because a second time would not be cheaper
+    FREE,  # if a step is longer than FREE * tolerances[DEFECT_GAP], its defect is also evaluated between nodes
+    MAY_REPEAT,  # 1: each iteration may evaluate accelerations twice; 0: only once, if twice takes twice as long
     N_OPTIONS,
 ) = range(6)
 
-START_CONTRACTION = 0.12  # the first step size is guessed so that a sweep multiplies deviations of the stages by this
+START_CONTRACTION = 0.12  # aim of the guessed first step size: each sweep multiplies the errors of the stages by this
 MAX_GUESSES = 4  # largest number of guesses of the first step size
 FACTOR_AFTER_DIVERGENCE = 0.6  # ratio of the next step size to the size of a step whose iteration did not converge
 SAFETY = 0.75  # safety factor on the step size for which the estimated error would equal the tolerance
-MAX_LIMITED = 24.0  # another method takes over if data[LIMITED], a count of steps limited by convergence, reaches this
-MIN_CURVATURE = 0.1  # if data[CURVATURE] is below this (in tolerances), accelerations hardly vary within a step
-N_PIVOT_PARTS = 4  # number of equal parts of a step; the smallest pivot of C_q is computed where two parts meet
+MAX_LIMITED = 24.0  # another method takes over if data[LIMITED] (steps limited by convergence) reaches this number
+MIN_CURVATURE = 0.1  # accelerations hardly vary within a step if data[CURVATURE] is below this (in tolerances)
+N_PIVOT_PARTS = 4  # pivots of C_q are checked at 1/4, 1/2 and 3/4 of a step, the ends of this number of equal parts
 MIN_PIVOT_RATIO = 0.4  # another method takes over if a step reduces the smallest pivot of C_q below this fraction
 # if the smallest tolerance is below this, another method takes over once a singular position was near. Without this
 # rule, five more runs of the benchmark A02 (N-four-bar mechanism) end with wrong results
 TIGHT_TOLERANCE = 1e-8
-MAX_FAILURES = 12.0  # another method takes over if data[FAILURES] reaches this; a step without convergence adds 2
-CHECKED_GAP = 0.0908  # longest time between evaluations at and between the nodes, relative to the step size
+MAX_FAILURES = 12.0  # another method takes over if data[FAILURES] reaches this: +2 if a step diverges, -1 if accepted
+CHECKED_GAP = 0.0908  # longest time between evaluations, relative to the step size, if some are also between the nodes
 # largest ratio of successive step sizes: GROWTH_EARLY in the first N_EARLY steps of a run, GROWTH in later steps
 N_EARLY, GROWTH_EARLY, GROWTH = 6, 4.0, 1.3
 GROWTH_ONE_SWEEP = 30.0  # replaces GROWTH_EARLY after a step that took only one sweep
 MIN_FACTOR = 0.4  # smallest ratio of the next step size to the size of an accepted step
-LEAST_TREND = 0.4  # lower bound of `trend`, the ratio of the step sizes that the error estimates of two steps allow
-# step size that the convergence allows with two evaluations of accelerations in a sweep, relative to that with one
+LEAST_TREND = 0.4  # lower bound of the ratio of the step sizes that the errors of two successive steps allow
+# convergence allows steps this many times as long if each sweep evaluates accelerations twice instead of once
 GAIN_BY_REPEATS = 1.5
 # sweeps stop evaluating accelerations twice (REPEATS = 0) if the convergence allows steps this many times as long as
 # the error estimate allows: the second evaluation then saves no time
 MAX_REACH = 2.5
-MAX_EXTRAPOLATION = 3.0  # the step size that the error estimate allows counts as at most this times the actual size
+MAX_EXTRAPOLATION = 3.0  # upper limit of (step size that the error of a step allows) / (size of this step)
 _array_offsets = merged(array_offsets)
 
 
@@ -95,7 +95,7 @@ def _aligned_view(memory):
 
 @merged
 def _reuse_rejected_polynomial(f, data, state):
-    """Update `data` so that the polynomial of a rejected step predicts the shorter repeated step."""
+    """After a rejected step, let its polynomial of accelerations predict the stages of the next, shorter attempt."""
     f.retry_nodes(data, state)
     if data[field.OLD_DEGREE] == 0.0:
         data[field.OLD_DEGREE] = max(data[field.DEGREE], 3.0)
@@ -104,10 +104,11 @@ def _reuse_rejected_polynomial(f, data, state):
 
 @compiled
 def _solve_collocation(f, w, options, data, tolerances, t, h, state):
-    """Solve for the stages of a step of size h; return a code, an error estimate, and (next step size) / h.
+    """Solve for the stages of a step of size h; return a code, an error estimate, and a factor: next step size / h.
 
-    The stages are stored in `data`; the estimate is in tolerances. Codes: CONVERGED; REJECTED (estimate or defect too
-    large, or no convergence); GUESSED (guess the first step size again); NOT_COMPUTED (accelerations not computed).
+    The stages are stored in `data`, the memory of the method. The estimate is relative to the tolerances. Codes:
+    CONVERGED; REJECTED (estimate or defect too large, or no convergence); GUESSED (h, a guess of the first step size,
+    is poor: try h * factor instead); NOT_COMPUTED (accelerations could not be computed).
     """
     is_first, is_estimated = data[field.PREDICTS] == 0.0, tolerances[ESTIMATE] == 1.0
     h_max = tolerances[DEFECT_GAP] / CHECKED_GAP
@@ -151,10 +152,11 @@ def _solve_collocation(f, w, options, data, tolerances, t, h, state):
         max_factor = min(max_factor, factor_by_defect)
     max_factor = min(max_factor, h_max / h)
     extra_sweeps = data[field.SWEEPS] - data[field.N_TARGET]
-    # the motion may be stiff if accelerations hardly vary, but a step takes at least the target of sweeps minus 1
+    # the motion may be stiff if accelerations hardly vary, but the step needed as many sweeps as intended, or one less
     is_limited = data[field.CURVATURE] < MIN_CURVATURE and extra_sweeps >= -1.0
     data[field.LIMITED] = max(0.0, data[field.LIMITED] + (1.0 if is_limited else -1.0))
-    # `trend`: ratio of the step sizes that the estimates in this and in the last step allow; the next ratio is similar
+    # `trend`: step size that the error of this step allows / size that the error of the last step allowed. If it is
+    # below 1, the sizes fall from step to step, and the next step should be shorter by this factor
     h_allowed = h * min(data[field.FACTOR_OF_ERROR], MAX_EXTRAPOLATION)
     if error > 1e-6 and data[field.CURVATURE] >= MIN_CURVATURE:
         trend = 1.0 if is_first else min(max(h_allowed / data[field.ALLOWED_H], LEAST_TREND), 1.0)
@@ -175,7 +177,7 @@ def _solve_collocation(f, w, options, data, tolerances, t, h, state):
 
 @merged
 def _accept_polynomial(data):
-    """Update `data` so that the polynomial of an accepted step predicts the next step."""
+    """After an accepted step, let its polynomial of the accelerations predict the stages of the next step."""
     if data[field.OLD_DEGREE] > 0.0:
         data[field.NEXT_DEGREE], data[field.OLD_DEGREE] = data[field.OLD_DEGREE], 0.0
     data[field.CURRENT] = 1.0 - data[field.CURRENT]
@@ -213,7 +215,7 @@ def _passes_singular_position(f, w, t, h, state, new_state):
 
 @kernel(COMMIT)
 def commit_lobatto(f, w, options, memory, tolerances, accepted):
-    """Keep the polynomial of an accepted attempt to predict the next step; discard a rejected polynomial."""
+    """After an accepted attempt, keep the polynomial of its accelerations to predict the next step; else discard it."""
     data = _aligned_view(memory)
     if accepted and data[field.TRIED] == 1.0:
         _accept_polynomial(data)
@@ -249,9 +251,10 @@ def lobatto_step(f, w, options, memory, t, h, tolerances, state, new_state):
 
 @merged
 def _project_ends(f, w, options, data, n, n_ends, out_t, out_state):
-    """Project the states in the first n_ends rows of `out_state` onto the constraints, each in one lane of `data`.
+    """Project the ends of n_ends steps onto the constraints at once, each in one lane; `data` receives the results.
 
-    Each lane receives the projected state, accelerations, multipliers, and in VALID whether the projection converged.
+    The ends are the first rows of `out_state`, at the times `out_t`. Results of a lane: projected state, accelerations,
+    multipliers, and at VALID 1 if the projection converged, else 0.
     """
     begin_ends = _array_offsets(n, int(options[N_ITERATED]), int(options[N_ROWS]))[5]
     for k in range(LANES):
@@ -278,7 +281,7 @@ def _project_ends(f, w, options, data, n, n_ends, out_t, out_state):
 
 @merged
 def _adopt_projection(f, w, options, data, tolerances, driven, n, k, t, row, state):
-    """Copy the projected state in lane k of `data` to `row` and `state`; return False if the state is invalid.
+    """Copy the projected state in lane k of `data` to `row` and `state`; if it is invalid, return False instead.
 
     The state is invalid if its projection has failed or has moved positions, from those in `row`, by more than the
     tolerances, or if it violates redundant rows. If constraints depend on time (`driven`), the same limit holds for
@@ -309,7 +312,7 @@ def _adopt_projection(f, w, options, data, tolerances, driven, n, k, t, row, sta
 
 @merged
 def _can_take_next_step(w, data, tolerances, control, clock, h):
-    """Return True if a step of size h may follow now, although the integrator has not checked the last step yet."""
+    """Return True if the integrator need not act before a step of size h: it is not too short, and the method suits."""
     h_long = clock[at.H_LONG]
     if h <= control[at.SHORTEST] or h < COLLAPSED_STEP * h_long or _must_change_method(w, data, tolerances):
         return False
@@ -319,7 +322,7 @@ def _can_take_next_step(w, data, tolerances, control, clock, h):
 
 @merged
 def _take_steps(f, w, options, data, tolerances, control, clock, goal, state, n_most, out_t, out_state, out_steps):
-    """Take at most n_most steps up to the time `goal`; store their ends, before projection; return their number."""
+    """Take at most n_most steps up to the time `goal`, without projection; store their ends; return their number."""
     n, t, n_ends = w.Q.size, clock[at.T], 0
     while n_ends < n_most and t < goal:
         h_wanted = min(clock[at.H_NEXT], control[at.MAX_STEP])
@@ -353,8 +356,8 @@ def lobatto_steps(
 ):
     """Take at most LANES steps in a row, and project their ends together; return the number of accepted steps.
 
-    A group of steps ends when the run's number of accepted steps is a multiple of LANES. So the times at which the
-    integrator pauses do not influence the results.
+    This call also ends when the run's number of accepted steps is a multiple of LANES. So projections are grouped in
+    the same way, wherever the integrator pauses (for example to look for Ctrl-C), and results do not change.
     """
     data, n = _aligned_view(memory), w.Q.size
     if out_t.size < LANES or w.nearly_singular == 1.0:

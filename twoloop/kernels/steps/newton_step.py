@@ -4,12 +4,12 @@ The stage accelerations a_j of the independent coordinates must make the residua
 
     r_j = F(t_j, Q_j, V_j) - a_j = 0,  Q_j = q + c_j h v + h^2 sum_k (A A)_jk a_k,  V_j = v + h sum_k A_jk a_k,
 
-where F are the accelerations that the inner loop returns, and A, c is the tableau. J_q and J_v are the derivatives of F
-by the independent positions and velocities at a single state (simplified Newton's method). The corrections d solve
-(I - h^2 A A x J_q - h A x J_v) d = r, where x is the Kronecker product. In the basis of eigenvectors of A, this splits
-into systems I - (h l)^2 J_q - h l J_v of size n_dof: a real system for each real eigenvalue l of A, and a complex one
-for each pair. These systems have half the size of systems of a first-order form (Hairer & Wanner, Solving ODEs II,
-IV.8, for Radau IIA). Fixed-point iteration would need tiny steps.
+where F are the accelerations that the inner loop returns, and A, c are the Butcher tableau. J_q and J_v are the
+derivatives of F by the independent positions and velocities at a single state (simplified Newton's method). The Newton
+corrections d of all a_j solve (I - h^2 A A x J_q - h A x J_v) d = r, where x is the Kronecker product. In the basis of
+eigenvectors of A, this splits into systems with the matrices I - (h l)^2 J_q - h l J_v (n_dof, n_dof): a real system
+for each real eigenvalue l of A, and a complex one for each conjugate pair. They have half the size of systems for
+(q, v) (Hairer & Wanner, Solving ODEs II, IV.8, for Radau IIA). Fixed-point iteration would need tiny steps.
 """
 
 import numpy as np
@@ -53,9 +53,9 @@ MAX_ROUNDING_CORRECTION_FIXED = 1e-9
 
 @compiled
 def _solve_stages(f, w, options, memory, t, h, tolerances, q, v, A_stage):
-    """Solve for the stage accelerations A_stage (s, n) by Newton's method; return a code.
+    """Solve for the stage accelerations A_stage (s, n) by Newton's method; return DONE or a failure code.
 
-    On entry, A_stage contains predictions. memory[CONTRACTION] becomes the ratio of the last two Newton corrections.
+    On entry, A_stage contains the first guesses. memory[CONTRACTION] becomes last / last but one Newton correction.
     """
     s, A, A2, _, _, c = tableau_of(options)
     n = q.size
@@ -94,7 +94,7 @@ def _solve_stages(f, w, options, memory, t, h, tolerances, q, v, A_stage):
         correct_stages(f, w, options, memory, s, residual, A_stage)
         largest_q, largest_v = 0.0, 0.0
         for j in range(s):
-            change_q, change_v = Q_stage[j], V_stage[j]  # the stages are no longer needed: scratch
+            change_q, change_v = Q_stage[j], V_stage[j]  # overwrite the stages, which the next iteration computes anew
             for m in range(n):
                 change_q[m] = 0.0
                 change_v[m] = 0.0
@@ -129,8 +129,8 @@ def _solve_stages(f, w, options, memory, t, h, tolerances, q, v, A_stage):
 def _filter_errors(f, w, options, memory, h, e_q, e_v):
     """Remove stiff components of error estimates: replace (e_q, e_v) by (I - z J)^-1 (e_q, e_v), z = h gamma0.
 
-    J is the Jacobian of velocities and accelerations by (q_i, v_i); gamma0: see GAMMA0. The estimates are the first
-    n_dof entries of e_q and e_v (n_q); the other entries are scratch.
+    J is the Jacobian of (v_i, a_i) by (q_i, v_i). For gamma0, a constant of the method, see GAMMA0. The estimates are
+    the first n_dof entries of the vectors e_q and e_v (n_q each); the other entries are scratch.
     """
     s = int(options[STAGES])
     m = w.independent.size
@@ -141,7 +141,7 @@ def _filter_errors(f, w, options, memory, h, e_q, e_v):
 
 @compiled
 def _estimate_error(f, w, options, memory, h, tolerances, state, new_state, A_stage):
-    """Return the largest component of the filtered error estimate of a step, in units of the tolerances."""
+    """Return the embedded error estimate of a step, without stiff components: the largest component, in tolerances."""
     s, A, _, _, _, _ = tableau_of(options)
     n = w.Q.size
     q, v, a, q1, v1 = state[:n], state[n : 2 * n], state[2 * n : 3 * n], new_state[:n], new_state[n : 2 * n]
@@ -185,11 +185,11 @@ def _estimate_error(f, w, options, memory, h, tolerances, state, new_state, A_st
 
 @compiled
 def _error_in_slow_directions(f, w, options, memory, h, tolerances, state, new_state):
-    """Return the effect, in tolerances, of the slow part of the estimated velocity error E_V, see `velocity_error`.
+    """Return the effect, in tolerances, of the slowly decaying part of a velocity error, see `velocity_error`.
 
-    `filtered_velocity_error` assumes that the whole error lasts as long as its fastest component. Here, a filter keeps
-    the part that remains after STEPS_TO_DECAY steps, and this part is assumed to last for `motion_time`. If even the
-    whole E_V has an effect of at most 1, return 0. E_Q, E_V and the factors of the filter are overwritten.
+    The error is the vector E_V of `memory`. `filtered_velocity_error` assumes that all of it lasts only as long as its
+    fastest component. Here, a filter keeps the part that remains after STEPS_TO_DECAY steps; this part is assumed to
+    last for `motion_time`. If even all of E_V would have an effect of at most 1, return 0. E_Q, E_V are overwritten.
     """
     s, n = int(options[STAGES]), w.Q.size
     z = STEPS_TO_DECAY * h / options[newton_options_index(s) + at.GAMMA0]
@@ -202,7 +202,7 @@ def _error_in_slow_directions(f, w, options, memory, h, tolerances, state, new_s
         e_q[i] = 0.0
     if factor_filter(f, w, options, memory, s, z) == DONE:
         filter_error(f, w, options, memory, s, z, e_q, e_v)
-        # in unstable motion, the filter's matrix may be nearly singular; then the filtered error is too large
+        # in unstable motion, the filter's matrix may be nearly singular, and enlarge the error instead of reducing it
         error = min(error, velocity_error(w, tolerances, e_v, max_duration, state, new_state))
     if factor_filter(f, w, options, memory, s, h) != DONE:
         memory[at.H_FACTORED] = 0.0
@@ -225,7 +225,7 @@ def commit_newton(f, w, options, memory, tolerances, accepted):
 
 @kernel(ATTEMPT)
 def newton_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """Attempt a step of size h by Newton's method, with an embedded estimate of the error."""
+    """Attempt an implicit Runge-Kutta step of size h by Newton's method; estimate its error by an embedded formula."""
     s, _, _, b, bA, c = tableau_of(options)
     n = w.Q.size
     q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]
@@ -241,8 +241,8 @@ def newton_step(f, w, options, memory, t, h, tolerances, state, new_state):
     node = middle_node(c)
     while True:
         if memory[at.HAS_JACOBIAN] == 0.0:
-            # compute derivatives at the middle stage, where stiff directions differ least from those at other stages.
-            # The middle of the step is not used, because a force might act there, but at no stage
+            # compute derivatives at the middle stage, where stiff directions differ least from those at other stages,
+            # and not at the middle of the step: a short force might act there that acts at no stage
             dt = node * h
             for m in range(n):
                 q_mid[m] = q[m] + dt * (v[m] + 0.5 * dt * a[m])
@@ -273,8 +273,8 @@ def newton_step(f, w, options, memory, t, h, tolerances, state, new_state):
             break
         if memory[at.IS_FRESH] == 1.0 and (node == 0.0 or code != OUTER_DIVERGED):
             return Attempt(code, np.inf, 0.0)
-        # repeat the step with new derivatives. If they are new already, the extrapolated state of the middle stage may
-        # be wrong, and so may derivatives there, for example of friction: compute them at the beginning of the step
+        # no convergence: compute new derivatives, and try again. If they are new already, they may be wrong (as for
+        # friction), because the middle stage is extrapolated: compute them at the beginning of the step
         if memory[at.IS_FRESH] == 1.0:
             node = 0.0
         memory[at.HAS_JACOBIAN] = 0.0

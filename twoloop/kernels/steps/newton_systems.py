@@ -1,14 +1,15 @@
 """Solve linear systems of Newton's method in implicit steps: I - z^2 J_q - z J_v, z = h l, for each eigenvalue l of A.
 
-A is the tableau. J_q and J_v are the derivatives of the accelerations by the independent positions and velocities. The
-corrections x of the independent accelerations solve (I - z^2 J_q - z J_v) x = r. The velocities that the constraints
-allow are v = T v_i, T = [I; -Cqd^-1 Cqi], where Cqd and Cqi are the dependent and independent columns of C_q.
-Multiplied by T^T M T, the system becomes (`f`: kit, `w`: workspace)
+A is the matrix of the Butcher tableau, h the step size. J_q and J_v are the derivatives of the accelerations by the
+independent positions and velocities. The corrections x of the independent accelerations a_i solve
+(I - z^2 J_q - z J_v) x = r, where r is the residual of the equations for a_i. The velocities that the constraints allow
+are v = T v_i, T = [I; -Cqd^-1 Cqi], where Cqd and Cqi are the dependent and independent columns of C_q. Multiplied by
+T^T M T, the system becomes (`f`: kit, `w`: workspace)
 
     T^T (M - z^2 K - z D) T x = T^T M T r.
 
-K and D, the tangents, are the derivatives of Q - Cq^T lam by q and v, at constant lam. This omits the dependence of T
-and M on q, and of gamma on v. The omitted terms are not stiff, and are zero for linear constraints, so that a
+K and D, called tangents, are the derivatives of Q - Cq^T lam by q and v, at constant lam. This omits the dependence
+of T and M on q, and of gamma on v. The omitted terms are not stiff, and are zero for linear constraints, so that a
 simplified Newton's method does not need them. Under step-size control, steps are as long without them. Fixed steps in
 which a body turns by some 0.4 rad may fail without them, but converge with differences of the accelerations.
 
@@ -79,7 +80,7 @@ MAX_ROUNDING_CORRECTION = 0.1
 
 RELATIVE_DISPLACEMENT = 1e-7  # displacement of q or v in finite differences, relative to max(1, |value|)
 # if all coordinates are displaced at once, the displacement of coordinate i is multiplied by
-# 1 + DISPLACEMENT_INCREMENT * (i % N_INCREMENTS), because the effects of equal displacements might cancel each other
+# 1 + DISPLACEMENT_INCREMENT * (i % N_INCREMENTS): the effects of equal displacements might cancel each other
 DISPLACEMENT_INCREMENT, N_INCREMENTS = 0.37, 7
 
 # --- tangents K and D (derivatives of the forces by q and v): only the band |i - j| <= b is computed and read
@@ -127,7 +128,8 @@ def _has_jacobian_changed(f, w, t, q):
 def _subtract_reaction_tangent(f, w, t, q, moved, b, K):
     """Subtract d(C_q^T lam)/dq, computed by differences, from the entries of K (n_q, n_q) with |i - j| <= b.
 
-    w.G must be C_q at (t, q). Coordinates j, j + 2 b + 1, ... are displaced at once. `moved` (n_q) is scratch.
+    w.G must be C_q at (t, q). Coordinates j, j + 2 b + 1, ... are displaced together, as they affect different rows.
+    `moved` (n_q) is scratch.
     """
     n = q.size
     for j in range(n):
@@ -182,7 +184,7 @@ def fill_tangent_by_v(f, t, q, v, b, D):
 
 @compiled
 def reduce_to_independents(w, A, AT, B):
-    """Store A T in AT (n_q, n_dof), T^T A T in B (n_dof, n_dof); columns of T = [I; w.D^T]: the allowed velocities."""
+    """Project a matrix A (n_q, n_q) onto the velocities v = T v_i that C_q allows: store A T in AT, T^T A T in B."""
     n, m = AT.shape
     columns = columns_of(w.index)
     for i in range(n):
@@ -205,11 +207,11 @@ def reduce_to_independents(w, A, AT, B):
 
 @compiled
 def _fill_jacobians_from_tangents(f, w, memory, s, t, q, v):
-    """Store J_q and J_v, derivatives of accelerations by q_i, v_i, at the last evaluated state; return a code."""
+    """Store J_q, J_v (derivatives of accelerations by q_i, v_i), computed from those of the forces; return a code."""
     n = q.size
     m = w.independent.size
     w.n_jacobians += 1
-    # earlier factors are no longer needed: their storage receives K (later D), T^T M T, and products such as K T
+    # the storage of old factors is free now. It receives K (later D), T^T M T, and products such as K T
     K, R = as_matrix(matrix_storage(w, n, at.FILTER), n), as_matrix(matrix_storage(w, n, at.SYSTEMS), n)
     code = fill_tangent_by_q(f, w, t, q, v, n - 1, vector(memory, s, n, at.Q_MOVED), K, R)
     if code != DONE:
@@ -235,7 +237,7 @@ def _fill_jacobians_from_tangents(f, w, memory, s, t, q, v):
 
 @compiled
 def _fill_by_differences(f, w, options, t, q, v, a, by_v, q_moved, v_moved, a_new, J):
-    """Store in J the derivatives of accelerations `a` at (t, q, v) by q_i, or by v_i if `by_v`; return a code."""
+    """Store in J finite differences of accelerations by q_i (if `by_v`, by v_i); `a`: accelerations at (t, q, v)."""
     base, moved = (v, v_moved) if by_v else (q, q_moved)
     for column in range(w.independent.size):
         j = w.independent[column]
@@ -254,7 +256,7 @@ def _fill_by_differences(f, w, options, t, q, v, a, by_v, q_moved, v_moved, a_ne
 
 @compiled
 def _fill_dense_jacobians(f, w, options, memory, s, t, q, v, a):
-    """Store J_q and J_v, the derivatives of accelerations `a` at the last evaluated state; return a code."""
+    """Store J_q and J_v, the derivatives of the accelerations by q_i and v_i; `a`: accelerations at (t, q, v)."""
     if f.force_by_q_given == 1 and w.Rate.size == w.C.size:
         return _fill_jacobians_from_tangents(f, w, memory, s, t, q, v)
     n = q.size
@@ -285,7 +287,7 @@ def _fill_dense_jacobians(f, w, options, memory, s, t, q, v, a):
 
 @compiled
 def _factor_dense_matrix(w, memory, s, index, z, matrix):
-    """Store LU factors of I - z^2 J_q - z J_v (Newton's matrix) in `matrix`, pivots at `index`; return a code."""
+    """Factorize Newton's matrix I - z^2 J_q - z J_v in `matrix`; return DONE or SINGULAR; `index`: see `pivots_of`."""
     n, m = w.Q.size, w.independent.size
     Jq, Jv = as_matrix(matrix_storage(w, n, at.DERIVATIVE_Q), m), as_matrix(matrix_storage(w, n, at.DERIVATIVE_V), m)
     damped = memory[at.HAS_DAMPING] == 1.0
@@ -300,7 +302,7 @@ def _factor_dense_matrix(w, memory, s, index, z, matrix):
 
 @compiled
 def _filter_error_dense(w, options, memory, s, h, e_q, e_v):
-    """Filter e_v, an error estimate of v, given e_q, that of q (n_dof), as `filter_error` does; use dense factors."""
+    """Filter e_v (error estimate of v_i) as `filter_error` does, with dense factors; e_q: error estimate of q_i."""
     n = w.Q.size
     m = e_q.size
     gamma0 = options[newton_options_index(s) + at.GAMMA0]
@@ -324,9 +326,10 @@ def _band_view(numbers, n, b):
 
 @inlined
 def _border_views(w, n, r, b):
-    """Return views of three arrays stored behind K: independent rows of C_q (r, n), w.D (n - r + 1, r), indices (r).
+    """Return views of three copies made when K was computed: independent rows of C_q (r, n); w.D; indices.
 
-    The first two are copies from the state where K was computed. The indices are those of the dependent coordinates.
+    w.D (n - r + 1, r) is the derivative of dependent by independent velocities, transposed; its last row are velocities
+    due to drives. The indices (r) are those of the dependent coordinates. The copies stand behind the band of K.
     """
     numbers = matrix_storage(w, n, at.DERIVATIVE_Q)
     start = n * (2 * b + 1)
@@ -339,7 +342,7 @@ def _border_views(w, n, r, b):
 
 @compiled
 def _update_banded_residual(f, w, t, q, v):
-    """Store the residual Q - C_q^T w.lam at (t, q, v) in w.Q, and C_q in w.Gx."""
+    """Store the forces with reactions, Q - C_q^T w.lam, at (t, q, v) in w.Q, and C_q in w.Gx."""
     w.n_evaluations += 1
     w.Q[:] = 0.0
     f.force(t, q, v, f.p, w.Q)
@@ -352,9 +355,10 @@ def _update_banded_residual(f, w, t, q, v):
 
 @compiled
 def _fill_band(f, w, t, q, v, by_v, base, moved, b, band):
-    """Store K (D if `by_v`), differences of Q - C_q^T lam by q (by v) at (t, q, v), in `band`; return a code.
+    """Store in `band` the tangent K, or D if `by_v`, by finite differences at (t, q, v); return DONE or NOT_FINITE.
 
-    Columns j, j + 2 b + 1, ... are computed at once. `base`: Q - C_q^T lam at (q, v); `moved` (n_q): scratch.
+    K and D: derivatives of Q - C_q^T lam by q and v. Columns j, j + 2 b + 1, ... have no rows in common: one difference
+    yields them all. `base`: Q - C_q^T lam at (t, q, v); `moved` (n_q): scratch.
     """
     n = q.size
     base_point = v if by_v else q
@@ -386,7 +390,7 @@ def _copy_band(A, b, band):
 
 @compiled
 def _fill_bands_from_callbacks(f, w, memory, s, t, q, v, b):
-    """Store the bands of K and D, derivatives of forces at the last evaluated state, by callbacks; return a code."""
+    """Store the bands of K and D (derivatives of Q - C_q^T lam by q, v), which callbacks provide; return a code."""
     n = q.size
     K, R = matrix_storage(w, n, at.FILTER).reshape((n, n)), matrix_storage(w, n, at.SYSTEMS).reshape((n, n))
     code = fill_tangent_by_q(f, w, t, q, v, b, vector(memory, s, n, at.Q_MOVED), K, R)
@@ -402,7 +406,7 @@ def _fill_bands_from_callbacks(f, w, memory, s, t, q, v, b):
 
 @compiled
 def _fill_banded_tangents(f, w, memory, s, t, q, v):
-    """Store bands of K and D (derivatives of forces) at the last evaluated state, and copy C_q, w.D; return a code."""
+    """Store the bands of K and D (derivatives of Q - C_q^T lam by q, v), and the arrays of `_border_views`."""
     n = q.size
     b = f.bandwidth
     w.n_jacobians += 1
@@ -437,9 +441,9 @@ def _fill_banded_tangents(f, w, memory, s, t, q, v):
 
 @compiled
 def _factor_banded(w, memory, s, b, index, z, numbers, factorize, substitute):
-    """Store the factors of M - z^2 K - z D (Newton's matrix), bordered by C_q, in `numbers`, and pivots; return a code.
+    """Factorize [[M - z^2 K - z D, Cq^T], [Cq, 0]], Newton's matrix with its border, in `numbers`; return a code.
 
-    `index`: index of the pivots, see `pivots_of`; `factorize`, `substitute`: LAPACK routines, real or complex.
+    `index`: where pivots are stored, see `pivots_of`. `factorize`, `substitute`: LAPACK routines, complex if z is.
     """
     n = w.Q.size
     K = _band_view(matrix_storage(w, n, at.DERIVATIVE_Q), n, b)
@@ -458,7 +462,7 @@ def _factor_banded(w, memory, s, b, index, z, numbers, factorize, substitute):
 
 @compiled
 def _multiply_by_T(w, b, x, X):
-    """Store T x[:n_dof] in X (n_q): the columns of T are the velocities that the constraints allow."""
+    """Store T x[:n_dof] in X (n_q): complete independent velocities by the dependent ones that C_q requires."""
     n_dof = w.independent.size
     _, D, columns = _border_views(w, w.Q.size, w.rows.size, b)
     for i in columns:
@@ -471,7 +475,7 @@ def _multiply_by_T(w, b, x, X):
 
 @compiled
 def _solve_and_keep_independents(w, b, numbers, pivots, substitute, x):
-    """Solve the bordered system for x (n_q), using the factors `numbers`; move independent entries to x[:n_dof]."""
+    """Solve the bordered system with right-hand side x (n_q); store the result for v_i in x[:n_dof]."""
     Cq, _, _ = _border_views(w, x.size, w.rows.size, b)
     solve_bordered(w, b, Cq, numbers, pivots, substitute, x)
     for k in range(w.independent.size):  # in ascending order, no entry is overwritten before it is read
@@ -480,7 +484,7 @@ def _solve_and_keep_independents(w, b, numbers, pivots, substitute, x):
 
 @compiled
 def _filter_error_banded(f, w, options, memory, s, h, e_q, e_v):
-    """Filter e_v[:n_dof], an error estimate of v, given e_q, that of q, as `filter_error` does; use banded factors."""
+    """Filter e_v (error estimate of v_i) as `filter_error` does, with banded factors; e_q: error estimate of q_i."""
     n = w.Q.size
     b = f.bandwidth
     z = h * options[newton_options_index(s) + at.GAMMA0]
@@ -498,8 +502,8 @@ def _filter_error_banded(f, w, options, memory, s, h, e_q, e_v):
 
 # --- sparse storage, for all coordinates
 
-# the pattern of K and D is complete if K or D times a displacement differs from the change of the residual by at most
-# this fraction of the sum of the absolute terms of the product
+# the sparsity pattern of K and D (derivatives of the residual by q, v) is complete if their product with a displacement
+# predicts the change of the residual: the difference must be at most this fraction of the sum of |terms| of the product
 MAX_DEVIATION = 0.2
 RESIDUAL_ROUNDING = 1e-13  # rounding error of a difference of residuals, relative to the largest term of a residual
 N_SPARSE_VECTORS = 3  # number of real scratch vectors, which _sparse_scratch returns first
@@ -515,7 +519,10 @@ def matrices_size(program: np.ndarray, n_mass: int, n_jacobian: int, n_systems: 
 
 @inlined
 def _sparse_derivative_views(f, w):
-    """Return views of w.matrices: entries of M, G, K, D; copy of w.is_independent; `stiffness` of redundant rows."""
+    """Return six views of w.matrices: stored entries of M, G, K and D; and for each row of G, two numbers.
+
+    The first is 1 if the row is independent, else 0. The second is the factor `stiffness`, see sparse_ldl.py.
+    """
     n_mass, n_jacobian, n_rows = w.mass_values.size, w.jacobian_values.size, w.is_independent.size
     begin_K = n_mass + n_jacobian
     begin_D = begin_K + mass_entries_of(f.newton_program)[0].size - n_mass
@@ -550,7 +557,7 @@ def _sparse_scratch(f, w):
 
 @inlined
 def _sparse_factor_view(f, w, k):
-    """Return a real view of factors in w.matrices: of the filter's matrix (k = 0), or for eigenvalue k - 1 (k > 0)."""
+    """Return a real view of sparse factors: of the matrix of `filter_error` if k = 0, else of eigenvalue k - 1."""
     n = f.newton_program[N_PIVOTS]
     n_factors = n + 2 * f.newton_program[N_OFF_DIAGONAL]
     begin = w.mass_values.size + w.jacobian_values.size + (N_SPARSE_VECTORS + 7) * n
@@ -584,9 +591,10 @@ def _fill_sparse_residual(f, w, t, q, v, renews_G, out):
 
 @compiled
 def _fill_tangent_entries_by_differences(f, w, t, q, v, by_v, base, residual, moved, entries):
-    """Store in `entries` the entries of K (of D if `by_v`), the derivative of the residual by q (by v); return a code.
+    """Store in `entries` finite differences of the residual by q (if `by_v`, by v); return DONE or NOT_FINITE.
 
-    All columns of a group are computed at once. `base`: residual at (q, v); `residual` and `moved` (n_q): scratch.
+    Columns of a group have no rows in common: one difference yields them all. `base`: residual at (t, q, v);
+    `residual` and `moved` (n_q): scratch.
     """
     rows, columns, begins = tangent_entries_of(f.newton_program)
     base_point = v if by_v else q
@@ -608,10 +616,10 @@ def _fill_tangent_entries_by_differences(f, w, t, q, v, by_v, base, residual, mo
 
 @compiled
 def _has_complete_pattern(f, base, residual, base_point, moved, largest, entries, predicted):
-    """Return True if K or D, with the `entries`, times the displacement agrees with the difference of the residuals.
+    """Return True if a sparse tangent (K or D) lacks no entries: it must predict the change of the residual.
 
-    `base`, `residual`: residuals at `base_point` (q or v), and at `moved`. `largest`: largest term of a residual.
-    `residual` and `predicted` (n_q) are overwritten.
+    `entries`: entries of the tangent. `base`, `residual`: residuals at `base_point` (q or v) and at the displaced point
+    `moved`. `largest`: largest term of a residual, for rounding. `residual` and `predicted` (n_q) are overwritten.
     """
     rows, columns, _ = tangent_entries_of(f.newton_program)
     predicted[:] = 0.0
@@ -628,7 +636,7 @@ def _has_complete_pattern(f, base, residual, base_point, moved, largest, entries
 
 @compiled
 def _fill_sparse_tangents(f, w, memory, t, q, v):
-    """Store the entries of K and D (derivatives of the residual) at the last evaluated state (t, q, v); return a code.
+    """Store the sparse K and D (derivatives of the residual by q, v) at the last evaluated state; return a code.
 
     The code is NEEDS_DENSE if there is no program for sparse storage, or if its sparsity pattern lacks entries.
     """
@@ -672,7 +680,7 @@ def _fill_sparse_tangents(f, w, memory, t, q, v):
 
 @compiled
 def _factor_sparse_matrix(f, w, z, factors):
-    """Store the factors of [M - z^2 K - z D, G^T; G, 0] (Newton's matrix), z real or complex; return a code."""
+    """Factorize Newton's sparse matrix [M - z^2 K - z D, G^T; G, 0], z real or complex; return DONE or SINGULAR."""
     mass, jacobian, K, D, is_independent, stiffness = _sparse_derivative_views(f, w)
     _, _, _, pivot_sizes, _, _ = _sparse_scratch(f, w)
     w.n_factorizations += 1
@@ -696,7 +704,7 @@ def _fill_sparse_right_side(f, w, r, right):
 
 @compiled
 def _filter_error_sparse(f, w, options, s, h, e_q, e_v):
-    """Filter e_v, an error estimate of v, given e_q, that of q (n_q), as `filter_error` does; use sparse factors."""
+    """Filter e_v (error estimate of v) as `filter_error` does, with sparse factors; e_q: error estimate of q (n_q)."""
     _, _, K, _, _, _ = _sparse_derivative_views(f, w)
     _, _, _, _, right, y = _sparse_scratch(f, w)
     z, n = h * options[newton_options_index(s) + at.GAMMA0], y.size
@@ -714,7 +722,10 @@ def _filter_error_sparse(f, w, options, s, h, e_q, e_v):
 
 @compiled
 def fill_derivatives(f, w, options, memory, s, t, q, v, a):
-    """Store derivatives of accelerations (dense storage) or of forces at the last evaluated state; return a code."""
+    """Store the derivatives for Newton's matrix at the last evaluated state (t, q, v); return DONE or an error code.
+
+    They are derivatives of accelerations in dense storage, else of forces. `a`: accelerations at this state.
+    """
     if f.form == FIXED_ORDER:
         return _fill_sparse_tangents(f, w, memory, t, q, v)
     if f.bandwidth >= 0:
@@ -724,7 +735,7 @@ def fill_derivatives(f, w, options, memory, s, t, q, v, a):
 
 @compiled
 def _factor_system(f, w, memory, s, index, z, numbers, factorize, substitute):
-    """Store factors of Newton's matrix, complex if z is, in `numbers`; arguments and code: see `_factor_banded`."""
+    """Factorize Newton's matrix for z, real or complex, in `numbers`; for arguments and code see `_factor_banded`."""
     w.n_factorizations += 1
     if f.bandwidth >= 0:
         return _factor_banded(w, memory, s, f.bandwidth, index, z, numbers, factorize, substitute)
@@ -733,7 +744,7 @@ def _factor_system(f, w, memory, s, index, z, numbers, factorize, substitute):
 
 @compiled
 def factor_filter(f, w, options, memory, s, h):
-    """Factor the real matrix I - z^2 J_q - z J_v of `filter_error`, z = h gamma0 (see GAMMA0); return a code."""
+    """Factorize I - z^2 J_q - z J_v, z = h gamma0 (see GAMMA0), the matrix of `filter_error`; return a code."""
     z = h * options[newton_options_index(s) + at.GAMMA0]
     if f.form == FIXED_ORDER:
         return _factor_sparse_matrix(f, w, z, _sparse_factor_view(f, w, 0))
@@ -742,7 +753,7 @@ def factor_filter(f, w, options, memory, s, h):
 
 @compiled
 def factor_systems(f, w, options, memory, s, h):
-    """Factor I - z^2 J_q - z J_v for `filter_error`, and with z = h l for each eigenvalue l of A; return a code."""
+    """Factorize all matrices of a step of size h: that of `filter_error`, and Newton's for each eigenvalue of A."""
     offset = newton_options_index(s)
     n_systems, n_real = count_systems(options, s), int(options[offset + at.N_REAL])
     code = factor_filter(f, w, options, memory, s, h)
@@ -762,7 +773,7 @@ def factor_systems(f, w, options, memory, s, h):
 
 @compiled
 def _solve_system(f, w, memory, s, index, numbers, substitute, X, x):
-    """Replace x[:n_dof], a right-hand side, by the solution of Newton's system; `numbers`: factors; X: scratch."""
+    """Replace x[:n_dof], a right-hand side, by the solution of Newton's system with the factors `numbers`."""
     m, pivots = w.independent.size, pivots_of(memory, s, w.Q.size, index)
     if f.bandwidth >= 0:
         _multiply_by_T(w, f.bandwidth, x, X)

@@ -13,9 +13,9 @@ from twoloop.kernels.control.step_size import commit_nothing
 from twoloop.kernels.data.common import ATTEMPT, Attempt, Step, allowed_error, compiled, inlined, kernel, merged
 from twoloop.kernels.data.indices import NOT_LOADED
 
-MAX_STEP_RATIO = 3.0  # a step predicts the stages of the next step if the next step is at most this many times as long
-# Richardson's estimate misses a force that jumps near an end of a step. So the estimate for a step is the larger of
-# Richardson's estimate and END_ERROR_WEIGHT * `estimate_end_error`
+MAX_STEP_RATIO = 3.0  # stages are extrapolated from the last step, unless the new step is more than this times as long
+# comparing a step with two half steps (Richardson) misses a force that jumps near an end of the step. So the error
+# estimate of a step is the larger of Richardson's and END_ERROR_WEIGHT * (result of `estimate_end_error`)
 END_ERROR_WEIGHT = 0.01
 
 # indices of the scalars in `options` of a method with s stages and the Butcher tableau A, b, c. After the scalars,
@@ -26,8 +26,8 @@ END_ERROR_WEIGHT = 0.01
     INNER_TOL,  # tolerance of the inner loop
     OUTER_TOL,  # tolerance of the outer loop
     EXTRAPOLATION,  # factor 1 / (2^order - 1) of Richardson's extrapolation; 0: the new state is not extrapolated
-    OUTER_TEST,  # coordinates in the test (32) of the paper, which ends the outer loop. 1: all; 0: independent ones
-    POWER,  # order of the method minus 1, see `estimate_end_error`
+    OUTER_TEST,  # 1: the outer loop ends when all coordinates have converged; 0: when the independent ones have
+    POWER,  # order of the method minus 1, an exponent in `estimate_end_error`
     N_SCALARS,
 ) = range(7)
 
@@ -42,7 +42,10 @@ def options_array(
     outer_test: float = 1.0,
     power: float = 0.0,
 ) -> NDArray[np.float64]:
-    """Return the array `options` (see STAGES) of an implicit Runge-Kutta method with the Butcher tableau A, b, c."""
+    """Return the array `options` of an implicit Runge-Kutta method with the Butcher tableau A, b, c.
+
+    The other arguments are the scalars explained at STAGES.
+    """
     A, b, c = np.asarray(A), np.asarray(b), np.asarray(c)
     scalars = np.array([float(len(b)), inner_tol, outer_tol, extrapolation, outer_test, power])
     vectors = (b, b @ A, c, lagrange_values(c, 0.0), lagrange_values(c, 1.0))
@@ -101,12 +104,12 @@ def interpolate(c, theta, A_stage, weights, a):
 def estimate_end_error(tolerances, options, h, state, new_state, A_stage):
     """Estimate the error of a step, in units of the tolerances (eq. 26), from the stage accelerations A_stage (s, n).
 
-    Let w be the range of the stage accelerations. Let e be the largest difference, at the ends of the step, between the
-    polynomial through the stage accelerations and the true accelerations. If each term of the polynomial is f times the
-    previous term, then e = w f^(s - 1), and the error of the method is about h w f^(order - 1): this is the estimate.
-    If the force jumps, even between an end of the step and the nearest stage, e is as large as w, and the estimate is
-    h w: steps then shrink until the jump no longer matters. Methods need a second estimate, too: e may be zero by
-    chance, with errors up to 100 tolerances.
+    The estimate detects forces that jump within a step, even between an end and the nearest stage. Let w be the range
+    of the stage accelerations, and e the error of their interpolation polynomial at the ends of the step, where the
+    accelerations are known. In smooth motion, terms of the polynomial decrease by a constant factor f. Then
+    e = w f^(s - 1), and the error of the method is about h w f^(order - 1): this is the estimate, with f from e and w.
+    After a jump, e is as large as w, and the estimate h w: steps shrink until the jump no longer matters. Methods need
+    a second estimate, too: e may be zero by chance, with errors up to 100 tolerances.
     """
     s, n = A_stage.shape
     offset = N_SCALARS + 2 * s * s + 3 * s
@@ -133,40 +136,40 @@ def estimate_end_error(tolerances, options, h, state, new_state, A_stage):
 
 
 # indices of the scalars in the part of `options` for Newton's method, counted from the beginning of this part. After
-# the scalars, the part contains the weights (s) of the error estimate. Then follow, for each eigenvalue of the matrix A
-# of the Butcher tableau, A = T diag(eigenvalues) T^-1 with the eigenvectors T: its real and imaginary part, its row of
-# T^-1 and its column of T (of both, s real parts, then s imaginary parts)
+# the scalars, the part contains the weights (s) of the error estimate. Then follows data of each eigenvalue of the
+# matrix A = T diag(eigenvalues) T^-1 of the Butcher tableau, T being the matrix of eigenvectors: real and imaginary
+# part of the eigenvalue; row of T^-1 and column of T that belong to it (of each, s real, then s imaginary parts)
 (
     N_REAL,  # number of real eigenvalues of the matrix A of the Butcher tableau
     N_PAIRS,  # number of pairs of conjugate complex eigenvalues of the matrix A of the Butcher tableau
-    GAMMA0,  # first real eigenvalue of the tableau's A; if there is none, smallest magnitude of an eigenvalue
+    GAMMA0,  # constant of the error filter: first real eigenvalue of the tableau's A, else smallest |eigenvalue|
     TESTS_VELOCITIES,  # 1: limit the estimated velocity errors themselves; 0: limit their effects, see `velocity_error`
     N_EIGEN_SCALARS,
 ) = range(5)
 
 # indices of the scalars in `memory`, the array in which a method keeps data from step to step
 (
-    HAS_TRIAL,  # 1: the last attempted step has filled the block TRIAL; in diagonal_step.py: a step was attempted
+    HAS_TRIAL,  # 1: a step was attempted (its stage accelerations are in the block TRIAL, except in diagonal_step.py)
     H_TRIAL,  # size of the last attempted step (s)
     HAS_PREVIOUS,  # 1: the block PREVIOUS contains the stage accelerations of the last accepted step
     H_PREVIOUS,  # size of the last accepted step (s)
     HAS_JACOBIAN,  # 1: Newton's method may use the stored derivatives of accelerations or forces; 0: compute new ones
     IS_FRESH,  # 1: the stored derivatives were computed for this step; 0: for an earlier step, or for this step's end
-    PARTITION_NUMBER,  # value of w.generation, the number of a partition, when the stored derivatives were computed
+    PARTITION_NUMBER,  # w.generation (number of partitions so far) when the stored derivatives were computed
     H_FACTORED,  # step size (s) for which the linear systems of Newton's method are factored; 0: no factors are stored
     CONTRACTION,  # ratio of the last correction of Newton's method to the one before
     HAS_DAMPING,  # 1: forces depend on velocities; 0: they do not, so that derivatives by velocities are zero
-    IS_SYMMETRIC,  # kind of factors in diagonal_step.py. 1: L D L^T, because the matrix is symmetric; 0: L U
+    IS_SYMMETRIC,  # 1: Newton's matrix in diagonal_step.py is symmetric, with factors L D L^T; 0: with factors L U
     ERROR_DURATION,  # time (s) for which a velocity error changes positions, see velocity_errors.py; 0: unknown
     DERIVATIVES_RENEWED,  # 1: diagonal_step.py has computed new derivatives at the end of the step; 0: it has not
     N_MEMORY_SCALARS,
 ) = range(14)
-# indices of the blocks (s, n_q) in `memory`: stage accelerations of the previous step and of the attempted step;
-# residuals of Newton's method, positions and velocities of the stages
+# indices of the blocks (s, n_q) in `memory`: stage accelerations of the last accepted and of the attempted step;
+# residuals of Newton's method; positions and velocities of the stages
 PREVIOUS, TRIAL, RESIDUAL, Q_STAGE, V_STAGE, N_BLOCKS = range(6)
-# indices of the vectors (n_q) after the blocks. For finite differences: accelerations at a displaced state, and the
-# positions and velocities of this state. Then estimated errors of positions and of velocities; and positions,
-# velocities and accelerations at the middle stage
+# indices of the vectors (n_q) after the blocks. A_NEW, Q_MOVED, V_MOVED: accelerations, positions and velocities of a
+# displaced state, for finite differences. E_Q, E_V: estimated errors of positions and of velocities. Q_MID, V_MID,
+# A_MID: positions, velocities and accelerations of the middle stage
 A_NEW, Q_MOVED, V_MOVED, E_Q, E_V, Q_MID, V_MID, A_MID, N_VECTORS = range(9)
 # indices of the parts of w.matrices, n_q^2 numbers each. The matrices are defined in newton_systems.py: J_q and J_v
 # (derivatives of accelerations by q and v), K and D (derivatives of forces by q and v), T (velocities v = T v_i)
@@ -180,9 +183,9 @@ DERIVATIVE_Q, DERIVATIVE_V, FILTER, SYSTEMS = range(4)
 def newton_options(
     A: NDArray[np.float64], b: NDArray[np.float64], c: NDArray[np.float64], tests_velocities: bool
 ) -> NDArray[np.float64]:
-    """Return the part of `options` for Newton's method (see N_REAL), which follows the result of `options_array`.
+    """Return the numbers that Newton's method needs at the end of `options`: eigenvalues and eigenvectors of A etc.
 
-    A, b, c: Butcher tableau; A must be diagonalizable. `tests_velocities`: value of TESTS_VELOCITIES.
+    A, b, c: Butcher tableau; A must be diagonalizable. `tests_velocities`: value of TESTS_VELOCITIES. See N_REAL.
     """
     values, T = np.linalg.eig(A)
     inverse = np.linalg.inv(T)
@@ -221,7 +224,7 @@ def memory_size(n_systems: int, s: int, n_q: int) -> int:
 
 
 def n_matrices(n_systems: int) -> int:
-    """Return the number of parts of w.matrices (see SYSTEMS) for `n_systems` linear systems of Newton's method."""
+    """Return how many matrices (n_q, n_q) w.matrices must hold for `n_systems` linear systems, see SYSTEMS."""
     return SYSTEMS + 2 * n_systems
 
 
@@ -313,7 +316,7 @@ def system_storage(w, n, k):
 
 @inlined
 def _storage_after_vectors(memory, s, n, k):
-    """Return a view (2 n) of `memory` that begins k * n numbers behind the end of the vectors (see A_NEW)."""
+    """Return a view of 2 n numbers of `memory`; it begins k * n numbers behind the end of the vectors (see A_NEW)."""
     start = N_MEMORY_SCALARS + (N_BLOCKS * s + N_VECTORS + k) * n
     return memory[start : start + 2 * n]
 
@@ -332,7 +335,7 @@ def complex_vector(memory, s, n, n_systems, index):
 
 @kernel(ATTEMPT)
 def request_loading(f, w, options, memory, t, h, tolerances, state, new_state):
-    """Take no step, but return an `Attempt` with the code NOT_LOADED: the caller loads the method, and tries again."""
+    """Take no step, but return the code NOT_LOADED: the caller loads the machine code of the method, then repeats."""
     return Attempt(NOT_LOADED, np.inf, 0.0)
 
 
@@ -350,12 +353,12 @@ LOADED_STEPS: dict[LazyStep, Step] = {}  # steps whose modules have been importe
 
 
 def load_step(step: Any) -> Any:
-    """Return `step`; for a LazyStep, return the Step in its module, which is imported if necessary."""
+    """Return `step` if it is a Step; if it is a LazyStep, import its module, and return the Step there."""
     if isinstance(step, LazyStep) and step not in LOADED_STEPS:
         LOADED_STEPS[step] = getattr(import_module(f"twoloop.kernels.{step.module}"), step.name)
     return step_if_loaded(step)
 
 
 def step_if_loaded(step: Any) -> Any:
-    """Return `step`; for a LazyStep, return the Step in its module, or PLACEHOLDER_STEP if it is not imported yet."""
+    """Return `step` if it is a Step; for a LazyStep, its Step if that is imported already, else PLACEHOLDER_STEP."""
     return LOADED_STEPS.get(step, PLACEHOLDER_STEP) if isinstance(step, LazyStep) else step

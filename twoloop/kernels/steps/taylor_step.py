@@ -39,33 +39,36 @@ from twoloop.kernels.evaluation.tasks import EVALUATE_WITHOUT_PROJECTION, SOLVE
 from twoloop.kernels.linalg.dense import copy
 from twoloop.kernels.linalg.saddle_point import solve_with_multipliers
 
-# indices of the scalars in `options`. After the scalars, `options` contains the offsets of the arrays of the series
-# program, then these arrays; an array of integers is stored by its bits, as if it contained floating-point numbers
+# indices of the scalars in `options`. After the scalars, `options` contains the series program (list of operations that
+# computes Taylor coefficients): the offsets of its arrays, then the arrays. Integers are stored as bits of floats
 (
     ORDER,  # order of the Taylor series of the positions q
     THETA,  # a projection has converged if its last correction is at most this, see `project`
     N_NODES,  # number of quantities of the program: inputs, unknowns and results of operations
-    EARLY_WIDTH,  # number of early operations (they depend on t and q only), rounded up to a multiple of eight
-    LATE_WIDTH,  # number of late operations (they depend on velocities, too), rounded up to a multiple of eight
-    KEEP,  # 1: all steps are parts of one longer step, and use the series about its beginning; 0: each has its own
+    EARLY_WIDTH,  # number of operations on t and q only (early operations), rounded up to a multiple of eight
+    LATE_WIDTH,  # number of operations on velocities, too (late operations), rounded up to a multiple of eight
+    KEEP,  # 1: the steps are parts of one step, and all use the series about its beginning; 0: each has its own
     N_SCALARS,
 ) = range(7)
-# indices of the arrays of an operation table (OperationGroups in twoloop.generate.series): its groups, and the first
-# arrays of the two lists of affine expressions (Sums) that are the arguments of its operations
+# the 13 arrays that describe a list of operations (OperationGroups in twoloop.generate.series): array 0: groups of
+# operations of the same kind; arrays 1 to 6: first argument of each operation; arrays 7 to 12: second argument
 GROUPS, FIRST, SECOND, N_TABLE = 0, 1, 7, 13
-# arrays of a list of affine expressions, see Sums in twoloop.generate.series; MORE_...: terms after the first of each
+# six arrays describe a list of affine expressions (Sums in twoloop.generate.series), such as the first arguments.
+# COLUMN, COEFFICIENT: quantity and factor of the first term of each expression. CONSTANT: constant of each expression.
+# ROW, MORE_COLUMN, MORE_COEFFICIENT: expression, quantity and factor of each further term
 COLUMN, COEFFICIENT, CONSTANT, ROW, MORE_COLUMN, MORE_COEFFICIENT, N_SUMS = range(7)
-SUM_INDICES = N_SUMS  # one more array of such a list: index at which the value of each expression is stored
-# indices, among the arrays of the series program, of the first arrays of its four parts: tables of early and of late
-# operations; lists of expressions for the rows of G v + (C_t, b) = 0, and of Q - G^T lam - M a = 0
+SUM_INDICES = N_SUMS  # seventh array of ROWS and BALANCE: index of the equation that each affine expression belongs to
+# the series program is a list of arrays; its four parts begin at these indices. EARLY: operations on t and q only.
+# LATE: operations on velocities, too. ROWS, BALANCE: affine expressions for G v + (C_t, b) and Q - G^T lam - M a
 EARLY, LATE, ROWS = 0, N_TABLE, 2 * N_TABLE
 BALANCE, N_ARRAYS = ROWS + N_SUMS + 1, ROWS + 2 * (N_SUMS + 1)
-# columns of GROUPS. KIND: kind of operation. BEGIN, END: range of the group's operations. MORE_FIRST and next column:
-# range of the entries of MORE_COLUMN for their first arguments. MORE_SECOND and next: for their second arguments
+# columns of the array GROUPS, which has a row for each group of operations. KIND: kind of operation. BEGIN, END: range
+# of the operations. MORE_FIRST and next column: range of the further terms (indices in MORE_COLUMN) of their first
+# arguments. MORE_SECOND and next column: the same for their second arguments
 KIND, BEGIN, END, MORE_FIRST, _, MORE_SECOND, _, N_GROUP = range(8)
 
-# indices of the scalars in `memory`. Two series of q (ORDER + 1, n_q each) and the arrays of `array_views` follow.
-# "Current series": the series about the beginning of the step. "Attempt": a step that may be rejected
+# indices of the scalars in `memory`. Two Taylor series of q (ORDER + 1, n_q each) and arrays (`array_views`) follow.
+# The current series is about the beginning of the step; the other one is about the end of the attempted step
 (
     HAS_SERIES,  # 1: the current series has been computed
     CURRENT,  # index of the current series among the two stored series: 0 or 1
@@ -74,19 +77,19 @@ KIND, BEGIN, END, MORE_FIRST, _, MORE_SECOND, _, N_GROUP = range(8)
     ALLOWED_SIZE,  # largest step size that the current series allows, in units of UNIT
     NEXT_ALLOWED_SIZE,  # step size that the series about the end of the last attempt allows, in units of NEXT_UNIT
     TRIED,  # 1: the last attempt has computed the series about its end, for the next step if the attempt is accepted
-    PASSED,  # if KEEP = 1: time (s) from the state about which the series is computed to the beginning of the step
+    PASSED,  # time (s) from the state about which the series is computed to the beginning of the step; 0 if KEEP = 0
     TARGET,  # index (0 or 1) of the stored series that `compute_coefficients` overwrites
-    # factor (at most 1) on step sizes that keeps the ends of steps near the constraints; 0: unknown
+    # factor (at most 1) by which step sizes are reduced so that steps end near the constraints; 0: unknown
     DISTANCE_FACTOR,
     ATTEMPTS,  # number of attempts; it determines at which times within a step the defect is evaluated
-    SUSPECTED,  # 1: SUSPECT is a time that the run has not passed yet; 0: there is no such time
-    SUSPECT,  # time (s) within a rejected step at which the defect was too large
+    SUSPECTED,  # 1: memory[SUSPECT] is a time that the run has not passed yet; 0: there is no such time
+    SUSPECT,  # time (s) at which the defect of a rejected step was too large: check the defect there again
     N_MEMORY_SCALARS,
 ) = range(14)
 
 
 def memory_size(order: int, n_q: int, n_rows: int, n_nodes: int, early: int, late: int) -> int:
-    """Return the length of `memory`; n_nodes, early, late: N_NODES, EARLY_WIDTH, LATE_WIDTH; n_rows: constraints."""
+    """Return the length of `memory`; n_nodes, early, late: options N_NODES, EARLY_WIDTH, LATE_WIDTH."""
     n_orders = order + 2
     scratch = n_orders * (n_nodes + 2 * early + 2 * late) + early + late + n_q + n_rows
     return N_MEMORY_SCALARS + 2 * (order + 1) * n_q + scratch + n_q
@@ -118,7 +121,7 @@ def series_view(memory, order, n, index):
 
 @merged
 def sum_of_products(X, Y, K, total):
-    """Store the sum of X[j, m] * Y[K - j, m] over 0 < j < K in total[m] for all m; eight sums are computed at once."""
+    """Sum up products of Taylor coefficients: total[m] = sum of X[j, m] * Y[K - j, m] over 0 < j < K, for all m."""
     for m in range(0, total.size, 8):
         s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = 0.0
         for j in range(1, K):
@@ -143,9 +146,11 @@ def sum_of_products(X, Y, K, total):
 
 @merged
 def _fill_arguments(options, sums, groups, g, more, values, out):
-    """Store in `out` an argument of each operation of a group: an affine expression of `values` without its constant.
+    """Compute the first (or second) argument of each operation of a group; store the arguments in `out`.
 
-    `sums`: index of the list of expressions. `g`: offset of the group in `groups`. `more`: MORE_FIRST or MORE_SECOND.
+    Arguments are affine expressions in `values`, the Taylor coefficients of one order of all quantities; constants are
+    left out, as they belong to order 0. `sums`: index of the arrays of the expressions. `g`: index at which the group's
+    row begins in `groups`. `more`: MORE_FIRST for first arguments, MORE_SECOND for second ones.
     """
     column, coefficient = _integer_array(options, sums + COLUMN), _float_array(options, sums + COEFFICIENT)
     for o in range(groups[g + BEGIN], groups[g + END]):
@@ -158,7 +163,10 @@ def _fill_arguments(options, sums, groups, g, more, values, out):
 
 @merged
 def _store_sums(options, sums, scale, values, out):
-    """Evaluate the affine expressions `sums` of `values` without their constants; store them times `scale` in `out`."""
+    """Evaluate affine expressions in `values`, without their constants; store them, times `scale`, in `out`.
+
+    `sums`: index of the arrays of the expressions, ROWS or BALANCE.
+    """
     column, coefficient = _integer_array(options, sums + COLUMN), _float_array(options, sums + COEFFICIENT)
     indices = _integer_array(options, sums + SUM_INDICES)
     for o in range(column.size):
@@ -171,10 +179,11 @@ def _store_sums(options, sums, scale, values, out):
 
 @compiled
 def start_operations(options, table, values, z, x, y):
-    """Store the Taylor coefficients of order 0 of a table of operations: results z, factors x, y of products.
+    """Begin the Taylor series of a list of operations: store the coefficients of order 0 of their results in z.
 
-    Products of x and y give the next coefficients of z. If the operation is a product, x and y are its arguments.
-    A pending product (its second factor depends on the accelerations) is set to zero.
+    `table`: EARLY or LATE. Further coefficients of z follow from products of two series x and y, which are also begun
+    here. If the operation is a product, x and y are its arguments. PENDING products, whose second factor depends on
+    accelerations that are not known yet, are set to zero.
     """
     groups = _integer_array(options, table + GROUPS)
     constant, constant_2 = (
@@ -213,10 +222,10 @@ def start_operations(options, table, values, z, x, y):
 
 @merged
 def _next_coefficients(options, table, K, values, z, x, y, x0, y0, total):
-    """Store the Taylor coefficients of order K > 0 of a table of operations: results z, factors x, y of products.
+    """Store the Taylor coefficients of order K > 0 of a list of operations: of the results z, and of x and y.
 
-    x0, y0: coefficients of order 0. `total`: result of `sum_of_products` for order K. For x and y, see
-    `start_operations`. The second factor of a pending product has no coefficient of order K yet: its term is left out.
+    `table`, x, y: see `start_operations`. x0, y0: coefficients of order 0. `total`: result of `sum_of_products` for
+    order K. In PENDING products, the term with coefficient K of the second factor, not known yet, is left out.
     """
     groups = _integer_array(options, table + GROUPS)
     inverse = 1.0 / K
@@ -258,18 +267,18 @@ def _next_coefficients(options, table, K, values, z, x, y, x0, y0, total):
 
 @merged
 def _fill_second_factors(options, table, values, y):
-    """Store the second factors of pending products in y, after the accelerations in `values` have been computed."""
+    """Store in y the second factors of PENDING products, which depend on the accelerations just added to `values`."""
     groups = _integer_array(options, table + GROUPS)
     _fill_arguments(options, table + SECOND, groups, groups.size - N_GROUP, MORE_SECOND, values, y)
 
 
 @inlined
 def array_views(options, memory, n, n_rows):
-    """Return views of `memory`: Taylor coefficients, sums of their products, and right-hand sides of linear systems.
+    """Return nine views of `memory`: N, X1, Y1, X2, Y2, total1, total2, r, c.
 
-    N: row k has the coefficients of order k of all quantities. X1, Y1, total1: the series x and y of early operations
-    (see `start_operations`), and sums of their products. X2, Y2, total2: the same for late operations. r (n) and
-    c (n_rows): right-hand sides.
+    Row k of N has the Taylor coefficients of order k of all quantities. X1, Y1: series x and y of the operations EARLY,
+    see `start_operations`; total1: sums of products of their coefficients. X2, Y2, total2: the same for LATE. r (n) and
+    c (n_rows): right-hand sides of the linear system of an order.
     """
     n_nodes, early, late = int(options[N_NODES]), int(options[EARLY_WIDTH]), int(options[LATE_WIDTH])
     order = int(options[ORDER])
@@ -294,7 +303,11 @@ def array_views(options, memory, n, n_rows):
 
 @merged
 def start_series(options, t, unit, state, N, series, begin_early, x, y, r, c):
-    """Begin a series in N: store order 0 of v and (from column begin_early) operations, 0 and 1 of t, q; clear r, c."""
+    """Begin the Taylor series of a motion at t and `state`: store the coefficients that need no accelerations in N.
+
+    These are orders 0 and 1 of t and q, and order 0 of v and of the operations EARLY (from column `begin_early`). x, y:
+    see `start_operations`. Also set the right-hand sides r and c to zero.
+    """
     n = r.size
     r[:], c[:] = 0.0, 0.0
     N[0, 0], N[1, 0] = t, unit
@@ -307,7 +320,7 @@ def start_series(options, t, unit, state, N, series, begin_early, x, y, r, c):
 
 @merged
 def integrate_coefficients(K, unit, N, series, a):
-    """Integrate `a` (n), the coefficients of order K - 1 of the accelerations: store order K of v and K + 1 of q."""
+    """Store the Taylor coefficients of order K of v and of order K + 1 of q, given order K - 1 of the accelerations."""
     n = a.size
     per_v, per_q = unit / K, unit / (K + 1)
     for j in range(n):
@@ -318,7 +331,7 @@ def integrate_coefficients(K, unit, N, series, a):
 
 @merged
 def finish_series(w, order, series):
-    """Count the evaluations; return DONE, or NOT_FINITE if a coefficient of the last order is not finite."""
+    """Count the solved linear systems; return DONE, or NOT_FINITE if a coefficient of the last order is not finite."""
     w.n_evaluations += order - 1
     n = series.size // (order + 1)
     for j in range(n):
@@ -331,7 +344,8 @@ def finish_series(w, order, series):
 def compute_coefficients(f, w, options, memory, t, state, unit):
     """Compute the Taylor series about `state` at t, with the unit of time `unit` (s); return DONE or NOT_FINITE.
 
-    It overwrites the stored series memory[TARGET]. The linear system of each order is solved with the factors in w.
+    The series overwrites the one of the two stored series whose index is memory[TARGET]. The linear system of each
+    order is solved with the factors that w has from the accelerations at this state.
     """
     n, n_rows, order = w.Q.size, w.Rate.size, int(options[ORDER])
     N, X1, Y1, X2, Y2, total1, total2, r, c = array_views(options, memory, n, n_rows)
@@ -371,28 +385,29 @@ def compute_coefficients(f, w, options, memory, t, state, unit):
     return finish_series(w, order, series)
 
 
-# aim of step sizes: distance of a step's end from the constraints before its projection, relative to that allowed
+# step sizes are chosen so that the distance of a step's end from the constraints, before projection, is about this
+# fraction of the allowed distance
 TARGET_PREDICTION_ERROR = 0.3
-# near the beginning of a step (NEAR_BEGIN), the series is exact: its defect there is a rounding error. A later defect
-# counts as one, too, if it is at most MAX_NOISE * allowed defect, and at most NOISE_RATIO * defect near the beginning
+# the series is exact near the beginning of a step, at NEAR_BEGIN: its defect there shows the rounding error. A later
+# defect counts as rounding error, too, if it is at most NOISE_RATIO times as large, and MAX_NOISE * allowed defect
 MAX_NOISE, NOISE_RATIO = 1e4, 10.0
-NEAR_BEGIN = 1e-5  # time after the beginning of a step, relative to the step size, at which the series is still exact
+NEAR_BEGIN = 1e-5  # time from the beginning of a step to a state where the series is exact, relative to the step size
 # the defect is checked at equidistant times within a step. At each attempt, these times shift by this fraction of their
 # spacing. Multiples of the golden section have evenly distributed fractional parts: so no time is missed for long
 GOLDEN_SECTION = 0.6180339887498949
-MAX_DEFECT = 1e300  # replaces an infinite defect, which means that a function has no finite value within the step
+MAX_DEFECT = 1e300  # replaces an infinite defect: a callback had no finite value within the step, which is rejected
 MIN_FACTOR = 0.1  # smallest ratio of the next step size to the size of a step rejected because of its defect
 MAX_GROWTH = 5.0  # largest ratio of successive step sizes, because coefficients are scaled by the previous step size
 MAX_FIRST_FACTOR = 1e6  # largest ratio of the first step size to its guess, so that powers of the ratio do not overflow
-TOO_SHORT = 2.0  # reported error (above 1: rejected) of a first step that is much shorter than the series allows
+TOO_SHORT = 2.0  # error above 1 by which a first step, much shorter than its series allows, is rejected and repeated
 
 
 @merged
 def _compute_series(f, w, options, memory, t, state, unit, index):
-    """Compute the Taylor series about `state`, the result of the last projection, as series `index`; return a code."""
+    """Compute the Taylor series about `state`, which was projected last; store it as series `index` (0 or 1)."""
     n = w.Q.size
     memory[TARGET] = index
-    if f.is_generated == 1 and w.used_general == 0.0:  # generated code, unlike general code, stores no factors in w
+    if f.is_generated == 1 and w.used_general == 0.0:  # generated code has stored no factors in w: compute them
         q, v, a = state[:n], state[n : 2 * n], series_accelerations(memory, n)
         code = f.general(f, w, EVALUATE_WITHOUT_PROJECTION, t, q, v, 0.0, a, w.lam)
         if code != DONE:
@@ -411,7 +426,7 @@ def _max_step(tolerances, series, unit, order, n):
         weight_v = 1.0 / (atol * unit + rtol * abs(series[n + j]))
         last = max(last, abs(series[row + j]) * max(weight_q, order * weight_v))
         before = max(before, abs(series[row_before + j]) * max(weight_q, (order - 1) * weight_v))
-    log_inverse = -np.inf  # logarithm of 1 / result
+    log_inverse = -np.inf  # logarithm of 1 / (largest step size)
     if last > 0.0:
         log_inverse = np.log(last) / order
     if before > 0.0:
@@ -421,9 +436,9 @@ def _max_step(tolerances, series, unit, order, n):
 
 @merged
 def _evaluate_series(series, unit, order, x, q, v, a):
-    """Set q, v and a (n each) to the values of a series after x units of time, by Horner's scheme.
+    """Evaluate a Taylor series of q and its two derivatives after x units of time, by Horner's scheme: set q, v and a.
 
-    Four or two coordinates are evaluated at once. The recurrence for a computes half the second derivative.
+    Four or two coordinates are evaluated at once, which is faster.
     """
     n, per_unit = q.size, 1.0 / unit
     a_factor = 2.0 * per_unit * per_unit
@@ -456,7 +471,7 @@ def _evaluate_series(series, unit, order, x, q, v, a):
 
 @compiled
 def _defect_at(f, w, memory, t, h, s, tolerances, series, order, q, v, a):
-    """Return the defect at the time t + s h relative to the allowed one, infinity if undefined; q, v, a: scratch."""
+    """Return defect / allowed defect of the series at the time t + s h, or infinity if callbacks fail there."""
     series_a = series_accelerations(memory, q.size)
     _evaluate_series(series, memory[UNIT], order, s * h / memory[UNIT], q, v, series_a)
     if evaluate_without_projection(f, w, t + s * h, q, v, a) != DONE:
@@ -466,7 +481,7 @@ def _defect_at(f, w, memory, t, h, s, tolerances, series, order, q, v, a):
 
 @compiled
 def _is_rounding_defect(f, w, memory, t, h, tolerances, series, order, q, v, a, defect):
-    """Return True if `defect` (relative to the allowed defect) is a rounding error, see MAX_NOISE; q, v, a: scratch."""
+    """Return True if `defect` (defect / allowed defect) is only a rounding error, see MAX_NOISE."""
     if defect > MAX_NOISE:
         return False
     noise = 0.0
@@ -477,10 +492,11 @@ def _is_rounding_defect(f, w, memory, t, h, tolerances, series, order, q, v, a, 
 
 @compiled
 def _first_large_defect(f, w, memory, t, h, tolerances, series, order, q, v, a):
-    """Return the first defect above 1 (relative to the allowed defect) within the step, or 0 if there is none.
+    """Check the defect within a step; return the first defect / allowed defect above 1, or 0 if there is none.
 
-    Evaluate it at SUSPECT, and at times that differ from attempt to attempt; skip rounding errors. The time of the
-    returned defect becomes SUSPECT unless SUSPECT is earlier. w.defect becomes the largest defect that is not returned.
+    It is evaluated at memory[SUSPECT], and at times that differ from attempt to attempt; rounding errors do not count.
+    The time of a returned defect is stored in memory[SUSPECT], unless an earlier time is there. w.defect becomes the
+    largest of the other defects.
     """
     max_gap, shift = tolerances[DEFECT_GAP], memory[ATTEMPTS] * GOLDEN_SECTION % 1.0
     n_points = 0
@@ -517,7 +533,7 @@ def commit_taylor(f, w, options, memory, tolerances, accepted):
 
 @kernel(ATTEMPT)
 def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """Attempt a step of size h by the series about its beginning, and compute the series about its end."""
+    """Attempt a step of size h by the Taylor series about its beginning; compute the series for the next step."""
     n, order, is_estimated = w.Q.size, int(options[ORDER]), tolerances[ESTIMATE] == 1.0
     q, v = state[:n], state[n : 2 * n]
     q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
@@ -538,7 +554,7 @@ def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
     x = (memory[PASSED] + h) / unit
     error, checks_defect, series_a = 0.0, False, series_accelerations(memory, n)
     if is_estimated:
-        error = x / memory[ALLOWED_SIZE]  # the estimated error is about a power of this ratio: both exceed 1 together
+        error = x / memory[ALLOWED_SIZE]  # exceeds 1 if the error exceeds the tolerances
         if error > 1.0 + GAP_SLACK:
             return Attempt(DONE, error, 1.0 / error)
         error = min(error, 1.0)
@@ -568,8 +584,8 @@ def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
     distance = prediction_error(w, tolerances, h, q, v, q1)
     memory[DISTANCE_FACTOR], allowed_factor = 1.0, np.inf
     if distance > 0.0:
-        # x / ALLOWED_SIZE, the ratio of the step size to the allowed one, counts as at least 1 / MAX_GROWTH: it may be
-        # small because MAX_GROWTH or a force ahead has shortened the step
+        # the step may be much shorter than the series allows, because of MAX_GROWTH or a force ahead. Its relative size
+        # x / ALLOWED_SIZE then counts as 1 / MAX_GROWTH
         allowed_factor = (TARGET_PREDICTION_ERROR / distance) ** (1.0 / order)
         memory[DISTANCE_FACTOR] = min(1.0, max(x / memory[ALLOWED_SIZE], 1.0 / MAX_GROWTH) * allowed_factor)
     if distance > 1.0:

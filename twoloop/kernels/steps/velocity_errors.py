@@ -24,15 +24,15 @@ from twoloop.kernels.steps.stages import INNER_TOL, block, vector
 # if a velocity error changes as slowly as the motion, it is not due to a vibration. It keeps its sign in later steps,
 # so that position errors add up. To allow for this, its duration is multiplied by up to this factor
 SLOW_FACTOR = 10.0
-LONGEST_GAPS = 10.0  # a velocity error is assumed to last at most this * longest time between evaluations
+LONGEST_GAPS = 10.0  # velocity errors last at most this many times the longest allowed time between evaluations
 STEPS_TO_DECAY = 10.0  # number of steps after which fast components of a velocity error count as decayed
-FAST_DURATION = 20.0  # a velocity error may change fast if it lasts less than this times z (step size times gamma)
+FAST_DURATION = 20.0  # a duration of a velocity error is short if below this * step size * coefficient of the method
 OUTDATED_CHANGE = 0.3  # the Jacobian J counts as outdated if its relative change exceeds this
 
 
 @compiled
 def filtered_velocity_error(w, memory, tolerances, z, unfiltered, filtered_once, filtered_twice, state, new_state, a1):
-    """Return the largest effect of an estimated velocity error, in units of the tolerances, see `velocity_error`.
+    """Estimate how long a velocity error lasts; return its largest effect in tolerances, see `velocity_error`.
 
     `unfiltered` (n_dof) is the velocity error. `filtered_once` and `filtered_twice` (n_dof) are this error multiplied
     once and twice by the filter (I - z J)^-1; z is the step size times a coefficient of the method, J the Jacobian.
@@ -47,7 +47,7 @@ def filtered_velocity_error(w, memory, tolerances, z, unfiltered, filtered_once,
         largest_v = max(largest_v, abs(v[w.independent[i]]))
         largest_a = max(largest_a, abs(a[w.independent[i]]), abs(a1[w.independent[i]]))
         largest = max(largest, abs(filtered_twice[i]))
-        # the right-hand side contains component i of (z J)^2 applied to filtered_twice
+        # as filtered = (I - z J)^-1 unfiltered, the last term is component i of (z J)^2 filtered_twice
         curvature = max(curvature, abs(filtered_twice[i] - 2.0 * filtered_once[i] + unfiltered[i]))
     if largest > 0.0:
         memory[at.ERROR_DURATION] = z * np.sqrt(largest / curvature)
@@ -76,7 +76,7 @@ def velocity_error(w, tolerances, e_v, duration, state, new_state):
 
 @compiled
 def motion_time(w, tolerances, state, a):
-    """Return the time (s) in which the motion changes: max|v| / max|a| of independent coordinates, see LONGEST_GAPS."""
+    """Return the time (s) in which velocities change: max|v_i| / max|a_i|, but at most the limit at LONGEST_GAPS."""
     n = w.Q.size
     largest_v = largest_a = 0.0
     for j in w.independent:
@@ -88,7 +88,7 @@ def motion_time(w, tolerances, state, a):
 
 @compiled
 def _derivatives_may_matter(w, memory, tolerances, z, unfiltered, max_duration, state, new_state):
-    """Return True if an outdated Jacobian J might make the error estimate wrong.
+    """Return True if the error estimate might be wrong because the Jacobian J was computed at an earlier state.
 
     There are two cases. First, the effect of the velocity error `unfiltered` (n_dof) would exceed the tolerances if it
     lasted `max_duration` (s). Second, the duration computed with J is short, and Newton's method converges so slowly
@@ -105,12 +105,12 @@ def _derivatives_may_matter(w, memory, tolerances, z, unfiltered, max_duration, 
 
 @compiled
 def derivatives_agree(f, w, options, memory, s, t, z, tolerances, unfiltered, e_q, e_v, state, new_state, a_end):
-    """Return True if J (stored Jacobian) agrees with the equations at the end of a step, or errors of J are harmless.
+    """Return True if the stored Jacobian J still holds at the end of a step, or if its errors are harmless.
 
-    t, a_end: time, accelerations at this end. z: step size times a coefficient of the method. (e_q, e_v) is equal to
-    (I - z J)^-1 u, where u is an error estimate with velocity part `unfiltered` (n_dof). So J (e_q, e_v) has the
-    velocity part (e_v - unfiltered) / z. This is compared with the difference between the accelerations at the end of
-    the step and at a state displaced from this end by a multiple of (e_q, e_v).
+    The test compares J (e_q, e_v) with the change of the accelerations when the end is displaced along (e_q, e_v).
+    These vectors are the filtered error estimate, (e_q, e_v) = (I - z J)^-1 u, where the estimate u has the velocity
+    part `unfiltered` (n_dof): so the acceleration part of J (e_q, e_v) is (e_v - unfiltered) / z. t, a_end: time and
+    accelerations at the end. z: step size times a coefficient of the method.
     """
     n = w.Q.size
     max_duration = max(motion_time(w, tolerances, state, state[2 * n :]), motion_time(w, tolerances, state, a_end))
