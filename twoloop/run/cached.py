@@ -1,8 +1,9 @@
 """Cache integrators: a call with the same options as an earlier call reuses the plan, code, arrays and checks.
 
 `CachedIntegrator` calls `start_and_advance` of kernels/cached_run.py, which checks the start and takes the first chunk
-of steps. A chunk is the steps of one call of compiled code. If the chunk reaches the end of the run, and Python has
-nothing to check, the fields of the result are computed when they are read. Otherwise `IntegrationLoop` continues.
+of steps. A chunk is the steps of one call of compiled code. Short runs end within this chunk: the fields of the result
+are then computed when they are read. If the run is longer, or Python has to check something, `IntegrationLoop` takes
+over after the chunk.
 """
 
 import time
@@ -74,14 +75,14 @@ from twoloop.run.workspace import GAMMA_ACCURACY, sparse_factors_pay
 Array = NDArray[np.float64]
 
 MAX_IDLE = 4  # largest number of unused integrators kept for equal options; each thread that integrates takes one
-# the first call of compiled code may attempt this number of chunks (`Run.chunk` steps each). Exception: one chunk if
-# `StiffnessMonitor` samples a state after each chunk. With more chunks, a run could ignore Ctrl-C for more than 0.1 s
+# the first call of compiled code may attempt this many times `Run.chunk` steps, or `Run.chunk` steps if states must be
+# sampled after each chunk (`StiffnessMonitor`). With more steps, a run could ignore Ctrl-C for more than 0.1 s
 N_FIRST_CHUNKS = 4
 N_SKIPPED_CALLS = 16  # after an exception in a callback, this number of calls do not use the cached integrator
 STEP_FIELDS = (*STEP_ARRAYS, "stats")  # fields of a result that are computed from the array of steps
 NON_STEP_DEFAULTS = {name: value for name, value in DEFAULTS.items() if name not in STEP_FIELDS}
-SHORT_RUN = 1e-3  # if the last run took less CPU time (s) than this, elapsed time is measured: that is faster
-HARMLESS = 0.01  # v0 is accepted if projecting it onto the constraints changes it by at most this number of tolerances
+SHORT_RUN = 1e-3  # if the last run took less CPU time (s), measure elapsed time instead: reading that clock is faster
+HARMLESS = 0.01  # v0 need not satisfy the constraints exactly: projection may change it by this number of tolerances
 REACHED_END = Status.REACHED_END  # a global name is read faster than a member of an Enum
 
 STEPS = OutputRequest()  # request for output at the ends of all steps, without dense output and events
@@ -89,7 +90,7 @@ STEPS = OutputRequest()  # request for output at the ends of all steps, without 
 
 @dataclass(frozen=True)
 class RepeatRequest:
-    """Request to repeat a run that may have missed short changes of forces."""
+    """Result of a run that may have missed short changes of forces: the caller must repeat it."""
 
     max_gap: float  # largest time between two evaluations in the repetition (s)
     cpu_time: float  # CPU time of the run to be repeated (s)
@@ -98,11 +99,11 @@ class RepeatRequest:
 class CachedIntegrator:
     """Integrator that is prepared once, and then used for many initial states, one after another.
 
-    run : a run at its start, used by this integrator only. Its system is `system`, or a copy of `system` in which
-        programs derived from traces replace missing callbacks.
-    code : the generated code that the steps of the run call; None if they call none.
+    run : a run at its start, used by this integrator only. Its system is `system`, or a copy of `system` with the
+        missing callbacks, derived from the others.
+    code : machine code generated for the mechanism, which the steps of the run call; None if they call none.
     definite : whether M is positive definite.
-    shared : setup that systems share if they differ only in their parameters.
+    shared : setup for all systems that differ from `system` only in parameters; None: use this system only.
     """
 
     def __init__(
@@ -125,8 +126,8 @@ class CachedIntegrator:
         self.evaluation, self.loops, self.code, self.skips = StartEvaluation(checked), cached_run(), code, 0
         self.arrays, self.callbacks = arrays_of(run, self.evaluation, code, definite, options, n_attempts), checked.kit
         self._start_and_advance = entry_point(self.loops.start_and_advance)
-        # indices in `arrays.block`, where the report ends at states_begin, the first number of the states. The report
-        # on one state and no step begins at one_state_begin; reports on more states and steps begin earlier
+        # `arrays.block` contains a report (numbers about the run, times and steps), and then the states, which begin at
+        # the index states_begin. The report on one state and no step begins at one_state_begin; longer ones, earlier
         self.states_begin, self.width = self.arrays.report.size, len(run.state)
         self.one_state_begin = self.states_begin - self.loops.N_HEAD - 1
         self.loop_used = False  # whether `IntegrationLoop` may have changed attributes of `run` other than arrays
@@ -134,15 +135,15 @@ class CachedIntegrator:
         # form of linear algebra at the start; CPU time of the last run (s), infinite before the first run
         self.form, self.cpu_time = run.kit.flags[FORM], np.inf
         self.interpolation = OutputInterpolation(run)
-        self.run_fields = run.rank, run.redundant, bool(run.plan.own)  # last entry: whether steps call generated code
+        self.run_fields = run.rank, run.redundant, bool(run.plan.own)  # the last: whether steps call generated code
         self.independent_rows = self.arrays.start_rows.tobytes()  # indices of independent constraint rows, as bytes
         self.redundancy = {self.independent_rows: (run.redundant, run.rows_warning)}
 
     @staticmethod
     def can_provide(run: Run, output: OutputRequest, shared: SharedSetup | None) -> bool:
-        """Return whether a cached integrator, which reuses its arrays, can provide the requested `output`."""
-        # interpolated output and `sol` must agree, but each would get an interpolator of its own. If setup is shared,
-        # the next run overwrites the parameters that `sol` would use
+        """Return whether a cached integrator may be used for the requested `output`; else a new run must be set up."""
+        # states at output times and `sol` must agree, but each would get an interpolator of its own. If systems share
+        # the run, the next system overwrites the parameters that `sol` would use
         if output.dense and (output.interpolated_times is not None or shared is not None):
             return False
         return output.interpolated_times is None or not (
@@ -160,11 +161,11 @@ class CachedIntegrator:
         time_limit: float | None,
         interrupts: Interrupts,
     ) -> dict[str, Any] | RepeatRequest | None:
-        """Integrate a system from a start; return the fields of the result, or a request to repeat the run.
+        """Integrate a system from a start, if possible by one call of compiled code; return the fields of the result.
 
-        If `IntegrationLoop` is not needed, the fields are `status` and `later`, a function that computes the other
-        fields when they are read. Return None if the start needs more checks, or if a callback raised an exception:
-        the caller then calls `set_up`, which does these checks and describes the problem.
+        After one call, the fields are `status` and `later`, a function that computes other fields when they are read.
+        Return a RepeatRequest if the run may have missed short changes of forces. Return None if the start needs more
+        checks, or if a callback raised an exception: `set_up`, called next, does these checks, and names the problem.
         """
         run, region, arrays, loops, parametric = self.run, self.region, self.arrays, self.loops, self.parametric
         is_due = region.is_comparison_due()
@@ -189,14 +190,14 @@ class CachedIntegrator:
                 n = self._start_and_advance(*start, loops.STATE_CHECKED)
             if n == loops.UNCHOSEN and self._pivots_suit_start(t0, q0):
                 n = self._start_and_advance(*start, loops.CHOICES_CHECKED)
-        except Exception as error:  # from a callback: the run is repeated, and `IntegrationLoop` handles the exception
+        except Exception as error:  # from a callback: a new run is set up, which handles it
             if raised_by_handler(error):
                 raise
             self.skips, arrays.last_start[loops.N_EQUAL] = N_SKIPPED_CALLS, loops.NEVER
             return None
         self.cpu_time = clock() - began
         fields: dict[str, Any] = {"status": REACHED_END}
-        n_rows, timed_states = n, None  # n >= 0: number of steps (and of states after the start); n < 0: a code
+        n_rows, timed_states = n, None  # n: number of steps (and of states after the start), or a code if negative
         rows_differ = run.rows_warning != "" and (rows := arrays.start_rows.tobytes()) != self.independent_rows
         if rows_differ and n >= 0 and rows in self.redundancy:
             self._use_independent_rows(rows)
@@ -237,12 +238,12 @@ class CachedIntegrator:
         is_due: bool,
         fields: dict[str, Any],
     ) -> dict[str, Any] | RepeatRequest | tuple[tuple[Array, Array] | None] | None:
-        """Check the first chunk of a run; if it is incomplete or needs more checks, continue by `IntegrationLoop`.
+        """Finish a run after its first chunk: continue by `IntegrationLoop` if necessary, check callbacks, interpolate.
 
-        If the loop continued, or a check failed, return what `integrate` has to return: fields, a request, or None (the
-        start needs more checks). Otherwise store `sol` in `fields` if it is requested, and return a tuple with one
-        element: the pair (output times, states), or None if output is at the ends of all steps.
-        `is_due`: whether this run has to compare callbacks with their traces at all sampled states.
+        If the loop continued, or a check failed, return what `integrate` has to return: fields, a RepeatRequest, or
+        None. Otherwise store `sol` in `fields` if it is requested, and return a tuple with one element: the pair
+        (output times, states), or None if output is at the ends of all steps. `is_due`: whether callbacks must be
+        compared with their traces at all sampled states, even if earlier runs did so near these states.
         """
         run, arrays, loops = self.run, self.arrays, self.loops
         n_rows, n_steps = arrays.filled.tolist()
@@ -284,9 +285,9 @@ class CachedIntegrator:
         return (timed_states,)
 
     def _check_new_start(self, t1: float, q0: Array, v0: Array) -> bool:
-        """Update the redundant rows at a new start; return False if the start or the parameters need more checks."""
+        """Find redundant rows at a new start, and check its parameters; return False if `set_up` must check more."""
         run = self.run
-        if run.rows_warning:  # if rows depend on one another, rounding may decide which of them counts as redundant
+        if run.rows_warning:  # rounding may decide which of several dependent rows is the redundant one
             independent = self.arrays.start_rows.tobytes()
             if independent not in self.redundancy:
                 new_run = run.copy_to_start(run.t0, q0, v0)
@@ -298,13 +299,13 @@ class CachedIntegrator:
         return self.parametric is None or self.parametric.callbacks_agree(run.t0, q0, v0, t1, mass, derivatives)
 
     def _use_independent_rows(self, rows: bytes) -> None:
-        """Set the redundant rows, and the warning about them, that belong to independent rows (indices, as bytes)."""
+        """Set the redundant rows of the run and the warning of them, given the indices of independent rows as bytes."""
         run = self.run
         run.redundant, run.rows_warning = self.redundancy[rows]
         self.run_fields, self.independent_rows = (run.rank, run.redundant, self.run_fields[-1]), rows
 
     def _return_to_start(self) -> None:
-        """Restore the attributes of the run, other than arrays, that `IntegrationLoop` may have changed."""
+        """Before the next run, restore attributes of `run` (other than arrays) that the last run may have changed."""
         run, self.loop_used = self.run, False
         if run.plan is self.attributes_at_start["plan"] and not run.substituted and run.kit.flags[FORM] == self.form:
             # keep the present kit: if `IntegrationLoop` has loaded a step of this plan, only this kit calls it
@@ -318,7 +319,7 @@ class CachedIntegrator:
         def states(all_states: bool) -> Array:
             sample = Sample(float(t[0]), rows[0], n)
             sample.add(t[1:], rows[1:], float(t[-1]), rows[-1])
-            # also check states with extreme t, q or v: then a repetition of the run lies within the checked region
+            # also check states with extreme t, q or v: then the same run, repeated, lies within the checked region
             return sample.states() if all_states else np.concatenate([extreme_states(t, rows[:, :n]), sample.states()])
 
         checks = t1, self.check_derivatives, REACHED_END, "", is_due, is_inside
@@ -347,7 +348,7 @@ def _deferred_field(
     options: Options,
     name: str,
 ) -> dict[str, Any]:
-    """Compute the field `name` of a result when it is read; return a dict of it and of fields computed with it."""
+    """Compute the field `name` of a result when it is first read; return a dict of all fields computed together."""
     if name == "message":
         return {name: describe_arrival(t1, options.step_size is not None)}
     loops, n_states, n_steps = cached_run(), int(data[0]), int(data[1])
@@ -364,7 +365,7 @@ def _deferred_field(
     return NON_STEP_DEFAULTS | state_fields(system.n_q, t, rows) | fields | options.metadata
 
 
-RECHECK_PIVOT = 0.1  # if smallest pivot at a start / smallest pivot at the first start is lower, `set_up` checks it
+RECHECK_PIVOT = 0.1  # `set_up` checks a start if its smallest pivot is below this times that of the first start
 
 
 def arrays_of(
@@ -435,13 +436,14 @@ def arrays_of(
 
 
 def _choice_as_array(choice: PivotChoice | None) -> tuple[NDArray[np.int64], float]:
-    """Return a choice of pivots as an array of integers for kernels (empty if `choice` is None), and a factor s.
+    """Return the pivots that generated code uses, as an array of integers for kernels, and a factor s.
 
-    If M is singular, terms s g^T g with some constraint rows g make it definite; s = 1 if M needs no such terms.
+    The array is empty if `choice` is None. If M is singular, the code adds s g^T g to M for some constraint rows g, so
+    that M becomes definite; s = 1 if nothing is added.
     """
     if choice is None:
         return np.zeros(0, dtype=np.int64), 1.0
-    # kernels cannot repeat a refined choice, for which Python may try several ways to add terms to M: OF_PYTHON
+    # OF_PYTHON: kernels cannot check this choice of pivots at a new start, because Python tried several terms of M
     index = cached_run().OF_PYTHON if choice.is_refined else int(np.searchsorted(-MIN_PIVOTS, -choice.min_pivot))
     numbers = index, len(choice.rows), len(choice.added_rows), *choice.rows, *choice.added_rows
     return np.array(numbers, dtype=np.int64), (*choice.scales, 1.0)[0]
@@ -453,20 +455,20 @@ MAX_OPTIONS, MAX_WORKSPACE, MAX_ENTRIES = 16, 150_000, 3
 
 
 class CacheEntry(NamedTuple):
-    """Cached run at its start, and idle integrators, for calls with the same options from the same or other starts."""
+    """Cached run at its start, with integrators made from it that are not in use, for calls with the same options."""
 
     run: Run
     start: tuple[float, bytes, bytes]  # t0, and the bytes of q0 and v0
     t1: float  # end of the run (s)
     code: GeneratedCode | None
     definite: bool  # whether M was definite at the start
-    for_other_starts: bool  # whether copies of the run can begin at other starts
-    idle: list[CachedIntegrator] | None  # integrators not in use; None: compiled code cannot start this run
-    shared: SharedSetup | None = None  # setup shared with systems that differ only in their parameters
+    for_other_starts: bool  # whether a copy of the run may be moved to another start
+    idle: list[CachedIntegrator] | None  # integrators not in use; None: only `set_up` can start this run
+    shared: SharedSetup | None = None  # setup for systems that differ only in parameters; None: one system
 
 
-# cache of a system's runs before the first run. Items: start (t0, q0, v0) of the last run, or None; dict from options
-# to cache entries; id() of the code that was generated for the last run, or None if that run reused a cache entry
+# initial cache of a system's runs: start (t0, q0, v0) of the last run, or None; dict of the cache entries, by options;
+# id() of the generated code of the last run, or None if that run reused a cache entry
 EMPTY_CACHE: tuple[Any, dict[Any, tuple[CacheEntry, ...]], int | None] = (None, {}, None)
 
 
@@ -483,8 +485,8 @@ def cached_result(
 ) -> tuple[dict[str, Any], str] | RepeatRequest | Run | None:
     """Integrate with the cached integrator for a system and options; create the integrator at the first call.
 
-    Return (fields of the result, warning about redundant rows or ""); or a request to repeat the run; or, if the run
-    cannot be cached, a `Run` at its start; or None if `set_up` must check the start.
+    Return one of four: (fields of the result, warning about redundant rows or ""); a RepeatRequest; a `Run` at its
+    start, which the caller integrates, as no cached integrator can; None if the caller must call `set_up` for a run.
     """
     entries = system.derived.get("runs", EMPTY_CACHE)[1].get(options.key, ())
     if not entries and (shared := system.shared.get("runs")):
@@ -524,7 +526,7 @@ def set_up(
     A run is cached if twoloop provides the method, callbacks are compiled, and callbacks agree with their traces. Raise
     TypeError or ValueError if the start is refused, the method cannot run the system, or code cannot be generated.
     """
-    if system.called_in_python:  # cache no run: functions called in Python may depend on variables that change
+    if system.called_in_python:  # not cached: Python functions may depend on variables that change
         return _new_run(system, t0, t1, q0, v0, options)[0], None
     start, key = (t0, q0.tobytes(), v0.tobytes()), options.key
     last_start, runs, last_code = system.derived.get("runs", EMPTY_CACHE)
@@ -565,7 +567,7 @@ def _make_cache_entry(run: Run, code: GeneratedCode | None, t1: float, options: 
     )
     start = t0, q0.tobytes(), v0.tobytes()
     can_start = for_other_starts and not run.start_warning and not system.called_in_python
-    idle: list[CachedIntegrator] | None = [] if can_start else None  # None: compiled code cannot start this run
+    idle: list[CachedIntegrator] | None = [] if can_start else None  # None: only `set_up` can start this run
     return CacheEntry(run.copy(), start, t1, code, definite, for_other_starts, idle)
 
 
@@ -576,7 +578,7 @@ def _trace_cache(system: ConstrainedSystem) -> TraceCache:
 
 
 def _share_setup(system: ConstrainedSystem, run: Run, code: GeneratedCode | None, t1: float, options: Options) -> None:
-    """When a second system differs from the first only in its parameters, cache a SharedSetup for all such systems."""
+    """If this system differs from an earlier one only in its parameters, cache a SharedSetup for all such systems."""
     key, functions, cached = (options.key, _trace_cache(system)), system.functions, system.shared.get("runs", {})
     if key not in cached:
         system.shared["runs"] = (cached if len(cached) < MAX_OPTIONS else {}) | {key: functions}
@@ -594,7 +596,7 @@ def _share_setup(system: ConstrainedSystem, run: Run, code: GeneratedCode | None
 def _copy_for_start(
     entry: CacheEntry, system: ConstrainedSystem, t0: float, t1: float, q0: Array, v0: Array, options: Options
 ) -> Run | None:
-    """Return a copy of a cached run at another start; None if the run's generated code or kit does not suit it."""
+    """Return a copy of a cached run, moved to another start; None if its code or linear algebra is not valid there."""
     _check_start(system, t0, q0, v0, options)
     if entry.code is not None and not entry.code.is_valid_from(system, t0, q0):
         return None
@@ -607,7 +609,7 @@ def _copy_for_start(
 def _new_run(
     system: ConstrainedSystem, t0: float, t1: float, q0: Array, v0: Array, options: Options
 ) -> tuple[Run, GeneratedCode | None]:
-    """Check a start, derive callbacks, generate code, choose a plan; return a new run and the generated code."""
+    """Set up a run: check its start, derive missing callbacks, generate code, choose a plan; return run and code."""
     has_fixed_step, original, new = options.step_size is not None, system, not system.checked
     if new:
         load_checked_bounds(system)
@@ -650,7 +652,7 @@ def _create_run(
     derived: Sequence[CallbackTraces],
     check_traces: Callable[[CallbackTraces], None],
 ) -> tuple[Run, GeneratedCode | None]:
-    """Return a new run that begins at a state, and the generated code that it calls, or None if it calls none."""
+    """Return a new run that begins at (t, q, v), and the generated code that its steps call; None: no such code."""
     fixed = options.step_size is not None
     code = code_for(system, options.method, fixed, options.compiled, t, q, check_traces)
     plan, interiors = plans_for(

@@ -33,12 +33,12 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-MAX_DIVIDED_INTERVALS = 512  # largest number of divided intervals whose interior states are cached
-MAX_ACCURATE_INTERVALS = 65536  # largest number of intervals remembered as accurate without interior states
-# a polynomial counts as accurate if its residual in constraints and equations of motion, relative to the tolerances, is
-# at most MAX_ERROR (across singular positions MAX_ERROR_ACROSS: there, velocity errors are ten times the residual)
+MAX_DIVIDED_INTERVALS = 512  # when interior states of more intervals than this are cached, the cache is emptied
+MAX_ACCURATE_INTERVALS = 65536  # largest number of intervals remembered to be accurate without interior states
+# a polynomial counts as accurate if it violates constraints and equations of motion by at most MAX_ERROR tolerances
+# (across a singular position, by MAX_ERROR_ACROSS tolerances: velocity errors are ten times the violation there)
 MAX_ERROR, MAX_ERROR_ACROSS = 10.0, 1.0
-N_REPAIR_STEPS = 4  # number of steps into which an interval is divided if its residual is above MAX_ERROR
+N_REPAIR_STEPS = 4  # number of steps into which an interval is divided if its polynomial is not accurate
 
 
 class StateTable(NamedTuple):
@@ -50,7 +50,7 @@ class StateTable(NamedTuple):
 
 
 def ranks_at(system: ConstrainedSystem, t: float, q: Array, v: Array, rtol: float) -> tuple[int, int]:
-    """Return the rank of C_q and the rank of [C_q; A] at a state: the argument `ranks` of `workspace`."""
+    """Return the rank of C_q and the rank of [C_q; A] (A: rows of non-holonomic constraints) at a state."""
     from twoloop.kernels import advance
 
     kit = make_kit(system, t, q)
@@ -65,7 +65,7 @@ class Interpolator:
     """Interpolator between the states of a `StateTable`, with a workspace of its own.
 
     `t0`, `row`: time and [q, v, a] of a state of the run. `ranks`: rank of C_q, and of all constraint rows. `plans`:
-    the keys are the kinds of intervals that must be divided. The value is the plan that divides such an interval into
+    for each kind of intervals that are too long for one polynomial, the plan of the method that divides them into
     `plan.parts` equal steps.
     """
 
@@ -91,10 +91,10 @@ class Interpolator:
         self.fixed_order = fixed_order_form(system, t0, row[: system.n_q], *self.plans.values())
         self.matrices = max((plan.matrices for plan in self.plans.values()), default=0)
         self._create_workspace()
-        self.failures, self.warns = 0, True  # number of states at which the last call failed; whether to warn of this
-        # keys of these two dicts: times at which intervals begin. Values of the first: (times, states), with both ends
+        self.failures, self.warns = 0, True  # number of states not projected in the last call; whether to warn of this
+        # for the time at which a divided interval begins: times and states within it, including both of its ends
         self.interior_states: dict[float, tuple[Array, Array]] = {}
-        # values of the second: `memory` of crossing steps (across a singular position), which contains their polynomial
+        # for the time at which a step across a singular position begins: its `memory`, which contains a polynomial
         self.crossing_memories: dict[float, Array] = {}
         self.accurate_intervals: set[float] = set()  # times at which intervals that need no interior states begin
         self.may_divide = True  # whether interior states may be computed; False if they were read from a file
@@ -113,7 +113,7 @@ class Interpolator:
         self._initialize_workspace()
 
     def _initialize_workspace(self) -> None:
-        """Compute the accelerations at the start, which initializes the workspace."""
+        """Compute the accelerations at the start, and thereby fill the arrays of the workspace."""
         from twoloop.kernels import advance
 
         system, t0, row = self.arguments[:3]
@@ -135,7 +135,7 @@ class Interpolator:
         self.nodes[:], self.scratch[:], self.rows[:] = 0.0, 0.0, 0.0
 
     def _switch_to_dense_form(self) -> None:
-        """Replace sparse factors in a fixed order of elimination, which have failed, by dense ones."""
+        """Use dense linear algebra from now on, because sparse factors in a fixed order of elimination have failed."""
         self.fixed_order = None
         self._create_workspace()
 
@@ -210,7 +210,7 @@ class Interpolator:
         return failures
 
     def _divide_inaccurate_intervals(self, table: StateTable, intervals: Integers) -> None:
-        """Compute interior states of each interval that one polynomial does not interpolate accurately; cache them."""
+        """Compute and cache interior states for each interval that one polynomial does not interpolate accurately."""
         start_times = table.t[intervals[:, indices.FIRST_OWN]].tolist()
         is_new = np.array([t not in self.accurate_intervals and t not in self.interior_states for t in start_times])
         if not self.may_divide or not is_new.any():
@@ -244,16 +244,17 @@ class Interpolator:
             self._repair_interval(table, intervals[k], float(errors[k]))
 
     def _estimate_residuals(self, table: StateTable, intervals: Integers) -> Array:
-        """Return the estimated residual of the polynomial of each of `intervals`, relative to the tolerances."""
+        """Estimate by how many tolerances each interval's polynomial violates constraints and equations of motion."""
         out, intervals = np.zeros(len(intervals)), np.ascontiguousarray(intervals)
         arrays = self.tolerances, table.t, table.states, intervals, self.nodes, self.scratch, self.rows, out
         entry_point(self.kernels.estimate_errors)(self.kit, self.work, INNER_TOL, *arrays)
         return out
 
     def _repair_interval(self, table: StateTable, interval: Integers, smallest: float) -> None:
-        """Let other states determine an interval's polynomial; cache those with the least residual, if < `smallest`.
+        """Replace an inaccurate polynomial of an interval by the best of three other ones, unless it is better.
 
-        Sets of states to try: states in a crossing step; ends of N_REPAIR_STEPS steps; the two ends of the interval.
+        The three go through states of a step across a singular position; through ends of N_REPAIR_STEPS steps; through
+        the ends of the interval only. `smallest`: violation by the present polynomial, see `_estimate_residuals`.
         """
         i, kind = int(interval[indices.FIRST_OWN]), int(interval[indices.KIND])
         begin = float(table.t[i])
@@ -276,7 +277,7 @@ class Interpolator:
             self.accurate_intervals.add(begin)
 
     def _cross_interval(self, table: StateTable, i: int) -> tuple[Array, Array] | None:
-        """Take a crossing step (see crossing_step.py) through interval i; return times and states, None on failure."""
+        """Step through interval i as if across a singular position; return times and states, or None on failure."""
         from twoloop.kernels.steps import crossing_step as kernels
 
         if self.fixed_order is not None:
@@ -293,7 +294,7 @@ class Interpolator:
         return self._states_in_crossing_step(table, i, plan.memory) if succeeded else None
 
     def _states_in_crossing_step(self, table: StateTable, i: int, memory: Array) -> tuple[Array, Array]:
-        """Return times and states in interval i, from the polynomial that a crossing step stored in `memory`."""
+        """Return times and states within interval i, by the polynomial that a step across it stored in `memory`."""
         from twoloop.kernels.steps.crossing_step import state_at
 
         n, options = self.system.n_q, crossing_plan(self.system.n_q).options
@@ -324,7 +325,7 @@ class Interpolator:
         return self.repair_plans[is_stiff]
 
     def _split_intervals(self, table: StateTable, intervals: Integers) -> tuple[StateTable, Integers, Integers]:
-        """Return a StateTable of cached interior states, the intervals (rows) that have such states, and the others."""
+        """Return a StateTable of cached interior states, the intervals (rows) that have them, and other intervals."""
         start_times = table.t[intervals[:, indices.FIRST_OWN]].tolist()
         is_divided = np.array([t in self.interior_states for t in start_times], dtype=bool)
         pairs = [self.interior_states[t] for t in start_times if t in self.interior_states]
@@ -345,7 +346,7 @@ class Interpolator:
         Return a dict: the key is the time at which an interval begins, the value is its (times, states).
         """
         n = self.system.n_q
-        tolerances = np.zeros(ATOL + n)  # all 0; ESTIMATE = 0: steps do not estimate errors
+        tolerances = np.zeros(ATOL + n)  # tolerances[ESTIMATE] = 0: steps do not estimate errors
         state = np.zeros(3 * n + self.system.n_c + self.system.n_a)
         step_arrays = (plan.options, plan.memory.copy(), plan.memory, tolerances, state, state.copy())
         interior_states = {}
@@ -365,9 +366,9 @@ class Interpolator:
         return interior_states
 
     def interior_blocks(self, table: StateTable) -> Iterator[tuple[Array, Array]]:
-        """Yield interior states of all divided intervals, in blocks, for a file; see `restore_interior_states`.
+        """Yield interior states of all divided intervals, in blocks, so that the caller can store them in a file.
 
-        A block has times (m, parts + 1) and rows (m, parts + 1, 3 n_q) of m intervals; missing states are NaN.
+        A block has times (m, parts + 1) and rows [q, v, a] (m, parts + 1, 3 n_q) of m intervals; missing ones are NaN.
         """
         intervals = _interval_rows(table, np.arange(len(table.t) - 1))
         for block in _blocks_of_intervals(intervals):
@@ -381,7 +382,7 @@ class Interpolator:
             yield t, states
 
     def restore_interior_states(self, t: Array, states: Array) -> None:
-        """Replace cached interior states by states from `interior_blocks`; compute no interior states from now on."""
+        """Use interior states read from a file, which `interior_blocks` has yielded; compute none from now on."""
         self.parts, self.may_divide = t.shape[1] - 1, False
         self._allocate_scratch()
         sizes = np.isfinite(t).sum(axis=1).tolist()
@@ -398,7 +399,7 @@ class Interpolator:
             failures = fill(self.kit, self.work, times, states, out)
         self.failures, n = failures, self.system.n_q
         if failures > 0:
-            # at a start in a singular position, store the known a; lam stays NaN (the run has warned of this)
+            # at a start in a singular position, store the known accelerations; multipliers stay NaN, as the run warned
             is_missing = np.isnan(out[:, :n]).any(axis=1)
             out[is_missing & (times == self.arguments[1]), :n] = self.arguments[2][2 * n :]
             n_missing = int(np.isnan(out[:, :n]).any(axis=1).sum())
@@ -408,17 +409,17 @@ class Interpolator:
 
 
 def _blocks_of_intervals(rows: Integers) -> list[Integers]:
-    """Return the rows of `_interval_rows` in blocks so small that the cache can hold the interior states of a block."""
+    """Divide a table of intervals into blocks so small that the cache can hold the interior states of a block."""
     return [rows[begin : begin + MAX_DIVIDED_INTERVALS] for begin in range(0, len(rows), MAX_DIVIDED_INTERVALS)]
 
 
 def _interval_rows(table: StateTable, numbers: Integers) -> Integers:
-    """Return a table of intervals (indices `numbers`) for kernels, without output times; columns: see indices.py."""
+    """Return the table of intervals that kernels read: a row for each index in `numbers`; columns: see indices.py."""
     rows = np.zeros((len(numbers), indices.N_COLUMNS), dtype=np.int64)
     rows[:, indices.FIRST_OWN], rows[:, indices.LAST_OWN] = numbers, numbers + 1
     rows[:, indices.KIND] = table.kinds[numbers]
     rows[:, indices.HIGH] = len(table.t) - 1
-    # polynomials across a singular position use no states before crossing steps: their rounding errors may be large
+    # polynomials of steps across a singular position use no states before these steps, where rounding may be large
     is_crossing = np.append(False, table.kinds == indices.ACROSS)
     (crossing_starts,) = (is_crossing[1:] & ~is_crossing[:-1]).nonzero()
     if crossing_starts.size:
@@ -439,7 +440,7 @@ def _warn_of_lost_rank(consequence: str, stacklevel: int = 4) -> None:
 
 
 class OutputInterpolation:
-    """Interpolation of states at output times, for successive runs that reuse the arrays of one `Run`."""
+    """Interpolation of states at output times, for one run after another by a cached integrator."""
 
     def __init__(self, run: Run):
         self.run, self._rows = run, np.zeros((0, 0))
@@ -468,7 +469,7 @@ class OutputInterpolation:
             return None
         a_and_lam = np.full((len(times), len(self.run.state) - rows.shape[1]), np.nan)
         interpolator.fill_accelerations(times, rows, a_and_lam)
-        if interpolator.fixed_order is not None or interpolator.repair_plans:  # its workspace suits this run only
+        if interpolator.fixed_order is not None or interpolator.repair_plans:  # other runs cannot use its workspace
             self._interpolator = None
         return np.concatenate([rows, a_and_lam], axis=1) if interpolator.failures == 0 else None
 

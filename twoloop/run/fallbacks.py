@@ -1,7 +1,8 @@
 """Continue a run where its own steps cannot: with another method, across a singular position, or over a jump.
 
-If forces changed for a short time, the run is repeated with more evaluations, at most MAX_REPETITIONS times: in noisy
-forces, every repetition would find shorter changes. If the last repetition finds shorter ones, too, the run warns.
+Also decide whether a run is repeated with more evaluations, because forces changed for so short a time that it may have
+missed other changes. It is repeated at most MAX_REPETITIONS times: in noisy forces, every repetition would find shorter
+changes. If the last repetition may have missed changes, too, the run warns.
 """
 
 from typing import NamedTuple
@@ -20,9 +21,9 @@ from twoloop.run.run import Run
 from twoloop.run.singular_positions import TimedState
 from twoloop.run.workspace import kit_for_plan, make_kit
 
-# limits of the duration of the shortest change of forces or drives that a run has seen, divided by the longest time
-# between its evaluations. Below REPEAT_BELOW, it may have missed shorter changes: repeat the run. Below WARN_BELOW, it
-# may even have missed other changes of this duration: warn if the run is not repeated
+# let r be the duration of the shortest change of forces or drives that a run has seen, divided by the longest time
+# between its evaluations. If r < REPEAT_BELOW, the run may have missed shorter changes, and is repeated. If
+# r < WARN_BELOW, it may even have missed changes of the same duration: it warns if it is not repeated any more
 REPEAT_BELOW, WARN_BELOW = 2.0, 1.25
 EVALUATIONS_PER_CHANGE = 4.0  # number of evaluations that a repetition makes within the shortest change seen so far
 MAX_REFINEMENT = 8.0  # largest factor by which a repetition reduces the longest time between evaluations
@@ -30,7 +31,7 @@ MAX_REPETITIONS = 2  # largest number of repetitions of a run
 
 
 def may_have_missed_changes(run: Run, limit: float = REPEAT_BELOW) -> bool:
-    """Return whether the shortest change of forces or drives is below `limit` times the longest evaluation gap."""
+    """Return whether the shortest change of forces is below `limit` times the longest time between evaluations."""
     a, clock = run.a, run.clock
     return bool(clock[a.SHORTEST_CHANGE] < limit * clock[a.WIDEST_SAMPLING])
 
@@ -42,7 +43,7 @@ def gap_for_repetition(run: Run) -> float:
 
 
 def warn_of_missed_changes(run: Run) -> str:
-    """Warn if a run that is not repeated may have missed short changes; return the warning as a sentence, else ""."""
+    """Warn if a run may have missed short changes of forces, and is not repeated; return the warning, or ""."""
     if not may_have_missed_changes(run, WARN_BELOW):
         return ""
     a, clock = run.a, run.clock
@@ -56,16 +57,17 @@ def warn_of_missed_changes(run: Run) -> str:
 
 Array = NDArray[np.float64]
 
-N_CORRECTIONS = 3  # number of Newton steps that reduce errors of positions from the tolerances to rounding
+N_CORRECTIONS = 3  # number of Newton steps that suffice to reduce errors of positions from the tolerances to rounding
 # in least-squares solutions, singular values up to this fraction of the largest count as zero (redundant rows)
 NEGLIGIBLE_RATIO = 1e-12
 MAX_RESIDUAL = 1e-8  # largest residual of the equations for v after a jump, relative to their right-hand side
 
 
 def state_after_jump(system: ConstrainedSystem, t: float, q: Array, v: Array) -> Array | None:
-    """Return the state [q, v] right after a jump of C_t or b at t; None if no velocities satisfy the constraints.
+    """Return the state [q, v] after an impact, as a drive's velocity has jumped; None if no velocities are consistent.
 
-    Solve M (v+ - v) + G^T p = 0 and G v+ + (C_t, b) = 0 for the velocities after the jump, v+, and the impulses p.
+    At t, the rate C_t, or b in A v + b = 0, is the one after the jump. Solve M (v+ - v) + G^T p = 0 and
+    G v+ + (C_t, b) = 0 for the velocities after the jump, v+, and the impulses p.
     """
     q = corrected_positions(system, t, q)
     equations, norms, largest = scaled_equations(system, t, q)
@@ -77,14 +79,14 @@ def state_after_jump(system: ConstrainedSystem, t: float, q: Array, v: Array) ->
 
 
 def corrected_positions(system: ConstrainedSystem, t: float, q: Array) -> Array:
-    """Return positions projected onto the constraints by N_CORRECTIONS steps of Newton's method."""
+    """Return q with its small violation of the constraints removed by N_CORRECTIONS steps of Newton's method."""
     for _ in range(N_CORRECTIONS if system.n_c > 0 else 0):
         q = q - np.linalg.lstsq(system.jacobian(t, q), system.constraint(t, q), rcond=NEGLIGIBLE_RATIO)[0]
     return q
 
 
 def scaled_equations(system: ConstrainedSystem, t: float, q: Array) -> tuple[Array, Array, float]:
-    """Return three values: the matrix [M G^T; G 0], rows of G scaled to norm max|M|; their original norms; max|M|."""
+    """Return the matrix [M G^T; G 0] with rows of G scaled to the norm max|M|, the norms before scaling, and max|M|."""
     mass, rows = system.mass(t, q), system.rows(t, q)
     norms, largest = np.linalg.norm(rows, axis=1), float(np.abs(mass).max())
     norms[norms == 0.0] = 1.0  # rows of zeros are not scaled
@@ -92,35 +94,36 @@ def scaled_equations(system: ConstrainedSystem, t: float, q: Array) -> tuple[Arr
     return np.block([[mass, scaled.T], [scaled, np.zeros((len(rows), len(rows)))]]), norms, largest
 
 
-# step sizes to try in turn across a singular position, relative to the first size. Larger sizes help if a step ends
-# before the position or too near it; smaller sizes, if the error is too large or a node is at the position
+# sizes of the steps that are tried in turn to get across a singular position, relative to the first one. Larger sizes
+# help if a step ends before the position or too near it; smaller ones, if its error is too large
 SIZE_RATIOS = (1.0, *(1.2**k for k in range(1, 12)), *(0.85**k for k in range(1, 28)))
 LARGEST_RATIO = max(SIZE_RATIOS)
-# a run that is still shorter than FIRST_STEPS times its longest recent step may have begun beside a singular position.
-# Its steps are then too short to suggest a size across the position, so much larger sizes are tried, too
+# if a run is near a singular position before it has lasted FIRST_STEPS times its longest recent step, it may have begun
+# beside this position, with short steps. Then much larger step sizes, LARGE_RATIOS, are tried across it, too
 FIRST_STEPS = 30.0
 LARGE_RATIOS = tuple(1.2**k for k in range(12, 30))
 # "distance" of a state from a singular position: smallest pivot of C_q, relative to its largest value in the run.
 # The base, the state at which the polynomial across the position begins, should have at least the distance FAR_BEFORE
 FAR_BEFORE = 0.2
-# wider limits: factor of the tolerances; factor of the time between evaluations (infinite if no force can be short)
+# if no step across a singular position succeeds, tolerances and the longest allowed time between evaluations are
+# multiplied by these factors (the time becomes unlimited if forces cannot be short)
 TOLERANCE_FACTOR, GAP_FACTOR = 10.0, 4.0
-NODE_DISTANCES = 1.0, 0.5, 0.25  # values of Limits.node_distance that are tried in turn
+NODE_DISTANCES = 1.0, 0.5, 0.25  # values of Limits.node_distance (see there) that are tried in turn
 
 
 class Limits(NamedTuple):
-    """Limits of steps across a singular position. If all attempts fail, wider limits are tried."""
+    """Limits for the polynomial and step across a singular position; if no step succeeds, wider ones are tried."""
 
     has_wide_gaps: bool  # whether the limit of the time between evaluations is multiplied by GAP_FACTOR
-    may_approach: bool  # whether steps may end before the position
-    tolerance_factor: float  # factor on the tolerances
+    may_approach: bool  # whether a step may end before the singular position, nearer to it than it began
+    tolerance_factor: float  # factor by which the tolerances of these steps are multiplied
     # nodes nearer to the position than this factor times the usual limit are left out, because their rounding errors
     # (which the error estimate shows) are larger. If a motion is slow near the position, few nodes are farther away
     node_distance: float
 
 
 class Origin(NamedTuple):
-    """Beginning and limits of a polynomial across a singular position; attempts with several step sizes share them."""
+    """Where a polynomial across a singular position begins, and its limits; several step sizes are tried with each."""
 
     earliest: float  # no node of the polynomial is before this time (s)
     base: TimedState | None  # earlier state at which the polynomial begins; None: it begins at the current state
@@ -128,12 +131,13 @@ class Origin(NamedTuple):
     may_end_beyond: bool = False  # whether the polynomial may end beyond the end of the run
 
 
-# another singular position is between two states if the earlier one has less than this fraction of the other's distance
+# the search for a base goes back in time. It stops at a state with less than this fraction of the largest distance so
+# far, as another singular position is near there
 MIN_DISTANCE_RATIO = 0.5
 
 
 def requires_crossing(run: Run, code: int) -> bool:
-    """Return whether `code`, which `advance` returned, requires steps across a singular position (crossing steps)."""
+    """Return whether special steps across a singular position must follow, as `advance` has returned `code`."""
     a, notes = run.a, run.work.notes
     if code == a.SWITCH_METHOD:
         from twoloop.kernels.steps.lobatto_step import TIGHT_TOLERANCE
@@ -144,7 +148,7 @@ def requires_crossing(run: Run, code: int) -> bool:
 
 
 def switch_method(run: Run) -> None:
-    """Replace a run's plan, whose steps fail or are unsuitable, by its substitute, and try the same step size again."""
+    """Continue a run with the substitute of its method, whose steps fail or do not suit the motion."""
     substitute = run.plan.substitute
     assert substitute is not None
     run.plan, run.memory = substitute.fresh(), substitute.memory  # `run.memory` holds initial values, and never changes
@@ -166,9 +170,10 @@ def renew_kit(run: Run) -> None:
 
 
 def cross_singularity(run: Run, past: list[TimedState]) -> tuple[Plan, Array]:
-    """Return the plan and the array `control` of steps across a singular position, and prepare the first step.
+    """Prepare steps across a singular position, see kernels/steps/crossing_step.py; return their plan and `control`.
 
-    See kernels/steps/crossing_step.py. `past`: states of the last accepted steps, oldest first; may be empty.
+    Set the first step size, and list the polynomials to try in `run.origins`. `control`: array of settings that
+    `advance` reads. `past`: states of the last accepted steps, oldest first; may be empty.
     """
     a, clock = run.a, run.clock
     from twoloop.kernels.steps.crossing_step import BACKWARD_FRACTION, NODE_GAP
@@ -178,15 +183,15 @@ def cross_singularity(run: Run, past: list[TimedState]) -> tuple[Plan, Array]:
     base, run.mirrored_size = None, 0.0
     if not has_fixed_step:
         base, run.mirrored_size = _find_base_state(run, [(t, state) for t, state in past if t >= earliest])
-    # try polynomials with several origins: the nodes of one may lie before a jump of a force; near the start or the end
-    # of the run, there may be too few nodes; a polynomial from an old base may be too long
+    # try polynomials that begin at several states: one may have nodes before a jump of a force; near the start or the
+    # end of the run, there may be too few nodes; a polynomial from an old state may be too long
     h_long, compiled = float(clock[a.H_LONG]), not run.system.called_in_python
     near_start = compiled and _is_near_start(run)
     near_end = compiled and clock[a.T] + LARGEST_RATIO * h_long > run.t1
     origins = [(earliest, base), *[(earliest, None)] * (base is not None), *[(-np.inf, None)] * bool(near_start)]
     origins.append((np.inf, None))
     ends = [False, True] if near_end and not has_fixed_step else [False]
-    if run.mirrored_size > run.t1 - clock[a.T]:  # the run ends close behind the position: try first to step beyond t1
+    if run.mirrored_size > run.t1 - clock[a.T]:  # the run ends soon after the position: first try a step beyond t1
         ends.reverse()
     run.origins = [Origin(*start, limits, beyond) for limits in _limits(run) for beyond in ends for start in origins]
     run.crossings.append([base or (float(clock[a.T]), run.state.copy())])
@@ -194,7 +199,7 @@ def cross_singularity(run: Run, past: list[TimedState]) -> tuple[Plan, Array]:
     control[: a.N_RULE] = plan.rule
     control[a.SYMMETRIC], control[a.MAY_CROSS], control[a.MAX_ATTEMPTS] = 0.0, 0.0, 1.0
     control[a.MAY_SWITCH] = control[a.TAKES_MANY] = 0.0
-    run.piece_ends = []  # forget pieces of an earlier run: cached integrators reuse `run`
+    run.piece_ends = []  # an earlier run may have left some, as integrators reuse `run`
     if control[a.FIXED_STEP] == 0.0:
         control[a.MAX_EVALUATION_GAP] = 1.0 if run.forces_may_be_steep else NODE_GAP / (1.0 - BACKWARD_FRACTION)
     clock[a.LIMIT_AGE] = 0.0
@@ -245,11 +250,11 @@ def _prepare_next_origin(run: Run, plan: Plan, control: Array) -> None:
 
 
 def _find_base_state(run: Run, past: list[TimedState]) -> tuple[TimedState | None, float]:
-    """Return the base (first state) of a polynomial across a singular position, and the mirrored step size (s).
+    """Return the base (first state) of a polynomial across a singular position, and a step size (s) from there.
 
     The base is the latest state in `past` that is far from the position, because rounding changes velocities near it.
-    If none is far, it is the farthest one; None if the current state is farther than all of them. If the distance
-    changes linearly, a step of the mirrored size ends as far beyond the position as the base is before it.
+    If none is far, it is the farthest one; None if the current state is farther than all of them. The step size is
+    such that the step would end as far beyond the position as the base is before it, if distances changed linearly.
     """
     a, clock, t, n = run.a, run.clock, float(run.clock[run.a.T]), run.system.n_q
 
@@ -297,9 +302,10 @@ def crossing_kit(kit: Kit) -> Kit:
 
 
 def handle_crossing(run: Run, plan: Plan, control: Array, code: int, n_accepted: int) -> tuple[Plan, Array, int]:
-    """Return plan, controls and code for the next steps of the loop, after an attempt to cross a singular position.
+    """Decide how to go on after an attempt to cross a singular position; return plan, `control` and code of next steps.
 
-    The next step is the next piece of the polynomial, an attempt with another size, or a step of the run's own method.
+    If the attempt has yielded a polynomial, the next steps follow it piece by piece. If it failed, another step size or
+    polynomial is tried. After the crossing, or if nothing is left to try, the run's own method continues.
     """
     from twoloop.kernels.steps import crossing_step as kernels
 
@@ -323,10 +329,10 @@ def handle_crossing(run: Run, plan: Plan, control: Array, code: int, n_accepted:
             clock[a.H_NEXT], clock[a.H_LIMIT] = run.piece_ends[0] - clock[a.T], np.inf
             return plan, control, a.PAUSED
     run.piece_ends, stored[kernels.END] = [], -np.inf
-    at_singular_start = run.starts_singular and clock[a.T] == run.t0  # no partition exists at t0 then
+    at_singular_start = run.starts_singular and clock[a.T] == run.t0  # then coordinates have no partition yet
     if at_singular_start and code == a.RANK_LOST:
         code = a.PAUSED
-    if n_accepted > 0:  # the whole polynomial counts as one step
+    if n_accepted > 0:  # for step-size control, all pieces of the polynomial count as one step
         clock[a.H_LONG] = max(clock[a.H_LONG], run.crossing_size)
         clock[a.H_NEXT] = max(clock[a.H_NEXT], run.crossing_size)
     if code == a.PAUSED and n_accepted == 0:
@@ -359,7 +365,10 @@ def handle_crossing(run: Run, plan: Plan, control: Array, code: int, n_accepted:
 
 
 def apply_jump(run: Run, t1: float) -> bool:
-    """Store the state after a jump of C_t or b in `run.new_state`, and restart the method; return False on failure."""
+    """Let velocities jump because a drive's velocity (C_t or b) jumps, and restart the method; return False on failure.
+
+    The state after the jump is stored in `run.new_state`, for the next call of `advance`.
+    """
     a, clock, n = run.a, run.clock, run.system.n_q
     t_after = float(clock[a.JUMP_TO])
     state = state_after_jump(run.system, t_after, run.state[:n], run.state[n : 2 * n])

@@ -1,9 +1,9 @@
 """Integrate chunk by chunk: call the compiled `advance`, handle the code that it returns, and record the run.
 
-Ctrl-C ends the run at any point, with the result so far. An exception between two arbitrary instructions of Python
-could leave arrays half written, and machine code can propagate exceptions only from its calls of Python. So Ctrl-C
-raises `KeyboardInterrupt` only within functions of the user, which may take long and whose callers expect exceptions.
-Elsewhere the signal is stored until the loop checks for it.
+A chunk is the steps of one call of `advance`. Ctrl-C ends a run at any time, with the result so far. An exception
+between two arbitrary instructions could leave arrays half written, and machine code can pass on exceptions only from
+Python functions that it calls. So Ctrl-C raises `KeyboardInterrupt` only within functions of the user, which may take
+long and whose callers expect exceptions. Elsewhere the signal is stored until the loop checks for it.
 """
 
 # module `signal` tries to convert each handler to an enum member, which takes 8 microseconds; `_signal` does not
@@ -82,16 +82,17 @@ MAX_STORED_SIGNALS = 3  # number of Ctrl-C signals that are stored; the next one
 
 
 class Interrupts:
-    """Handler of Ctrl-C that replaces Python's own handler (never a user's) until `restore_handlers` is called.
+    """Handler of Ctrl-C during a run. It replaces Python's own handler, but never one that the user has installed.
 
-    Before `install_handlers`, Ctrl-C raises KeyboardInterrupt, because no result would be lost yet.
+    It is active from `install_handlers` to `restore_handlers`. Before, Ctrl-C raises KeyboardInterrupt as usual,
+    because no result would be lost yet.
     """
 
     n_signals, _is_installed = 0, False  # n_signals: number of times that Ctrl-C was pressed
     handlers: SignalHandlers | None = None
 
     def install_handlers(self) -> "Interrupts":
-        """Install handlers that store signals, but raise an exception within functions of the user; return self."""
+        """Install handlers that store signals, or raise an exception within functions of the user; return self."""
         if self.handlers is None:
             self.handlers = SignalHandlers()
         if _signal.getsignal(signal.SIGINT) is signal.default_int_handler:
@@ -101,13 +102,13 @@ class Interrupts:
         return self
 
     def returns_result(self, error: BaseException) -> bool:
-        """Return whether the run returns a result after Ctrl-C has ended it by `error`.
+        """Return whether a run that the exception `error` ended still returns a result, because Ctrl-C caused it.
 
-        If a user's handler raised `error`, or after more than MAX_STORED_SIGNALS signals, there is no result.
+        It does not if a user's handler raised `error`, or if Ctrl-C was pressed more than MAX_STORED_SIGNALS times.
         """
         if self.handlers is None and raised_by_handler(error):
             return False
-        self.install_handlers()  # may raise: a signal that arrives now calls a user's handler or `_on_signal`
+        self.install_handlers()  # a signal that arrives meanwhile may raise an exception
         return self._is_installed and self.n_signals <= MAX_STORED_SIGNALS
 
     def restore_handlers(self) -> None:
@@ -142,19 +143,20 @@ def interrupted_fields(system: ConstrainedSystem, t0: float, events: list[Any] |
     return DEFAULTS | fields
 
 
-BUFFER_ROWS = 1024  # largest number of states in the buffers of a chunk
-BUFFER_STEPS = 4096  # largest number of steps in the buffers of a chunk
+BUFFER_ROWS = 1024  # largest number of states that one call of `advance` stores
+BUFFER_STEPS = 4096  # largest number of steps whose data one call of `advance` stores
 CHUNK_TO_EVENT = 16  # attempted steps in a chunk if an event may end the run, because steps beyond the event are wasted
-# chunks grow until one takes this CPU time (s); with longer chunks, Ctrl-C would be noticed late
+# the number of steps per chunk is doubled while a chunk takes less CPU time (s); Ctrl-C takes effect after a chunk
 CHUNK_TIME = 0.05
 # statuses whose message may say that stability limited the steps
 STATUSES_WITH_STIFFNESS_NOTE = {Status.REACHED_END, Status.EVENT, Status.MAX_STEPS, Status.TIME_LIMIT, Status.STAGNATED}
 # the polynomial across a singular position may begin at one of the last N_RECENT states, or at one of the last
-# N_RECENT ends of long steps. As many steps may be short, these ends are searched for among N_LAST_STATES states
+# N_RECENT states before them that a long step reached. These are searched for among the last N_LAST_STATES states
 N_RECENT, N_LAST_STATES = 16, 256
 CROSSING_OVERSHOOT = 100.0  # a crossing step may end beyond t1 by at most this multiple of the run's duration
 NO_KINDS = np.zeros(0, dtype=np.int64)  # kinds of intervals if no states between steps are requested
-# largest number of sets of buffers kept for later runs; a set with more floats in its buffer of states is not kept
+# MAX_SPARE: largest number of sets of buffers (times, states, steps of a chunk) kept for later runs. MAX_SPARE_FLOATS:
+# sets with more floats in the buffer of states are not kept
 MAX_SPARE, MAX_SPARE_FLOATS = 16, 250_000
 _spare_buffers: dict[tuple[int, int, int], Buffers] = {}  # sets of buffers for later runs, by their sizes
 
@@ -163,9 +165,9 @@ class IntegrationLoop:
     """Loop that integrates a run to its end, and records it.
 
     `start`: None if the run is at its start. If the caller has already taken the first chunk of steps, `start` is the
-    row [q, v, a, lam] at the start, and the caller then calls `add_first_chunk`. `system`: system for the result, given
-    if later runs will overwrite arrays of `run.system`. After each chunk, `report` is called with the time reached. If
-    `is_final_attempt`, warn if the run may have missed short changes of forces; else the caller repeats such a run.
+    row [q, v, a, lam] at the start, and the caller then calls `add_first_chunk`. `system`: system in the result,
+    given if later runs will overwrite arrays of `run.system`. `report`: called after each chunk with the time reached.
+    `is_final_attempt`: warn if the run may have missed short changes of forces; if False, the caller repeats such runs.
     """
 
     def __init__(
@@ -196,7 +198,7 @@ class IntegrationLoop:
         has_terminal_event = request.events is not None and any(event.terminal < np.inf for event in request.events)
         if has_terminal_event:
             self.largest_chunk = run.chunk = CHUNK_TO_EVENT
-        # number of attempted steps between two checks of progress; total number of attempted steps at the next check
+        # progress is checked whenever `check_interval` more steps have been attempted; `next_check`: total at that time
         self.check_interval = self.next_check = run.chunk
         self.plan, self.control, self.kit = run.plan, run.control, run.kit  # replaced while steps cross a singularity
         self.counts = INITIAL_COUNTS.copy()
@@ -214,7 +216,7 @@ class IntegrationLoop:
         self.code = INTERRUPTED if interrupts.n_signals else run.a.PAUSED
 
     def add_first_chunk(self, code: int, t: Array, rows: Array, steps: Array, cpu_time: float) -> None:
-        """Record copies of the first chunk's times, states and steps; act on `code`, which `advance` returned."""
+        """Record the first chunk, which the caller has taken, and act on `code`, which `advance` returned to it."""
         self.code, self.cpu_time = code, cpu_time
         self._store_chunk(t.copy(), rows.copy(), steps.copy(), self._interval_kinds(steps, False, False))
         self._handle_code(steps, False, cpu_time)
@@ -259,7 +261,7 @@ class IntegrationLoop:
         return self._build_record(check_derivatives)
 
     def _handle_code(self, steps: Array, in_crossing: bool, chunk_time: float) -> None:
-        """Act on `self.code`, the end code of a chunk; set it to PAUSED if the run goes on.
+        """Act on the code in `self.code`, with which a chunk ended; if the run goes on, replace it by PAUSED.
 
         `in_crossing`: whether the chunk tried to cross a singular position. `chunk_time`: its CPU time (s).
         """
@@ -278,7 +280,7 @@ class IntegrationLoop:
         run.control[a.MAX_ATTEMPTS] = min(run.chunk, max(0, self.next_check - run.n_attempts()))
         outputs = self.outputs
         is_crossing = self.plan is not run.plan and not run.piece_ends and run.control[a.FIXED_STEP] == 0.0
-        if is_crossing:  # the next output time does not shorten attempts across a singular position
+        if is_crossing:  # a step across a singular position does not end at output times
             outputs = np.append(outputs[:-1], self.t1 + CROSSING_OVERSHOOT * (self.t1 - run.t0))
         self.n_filled[:] = 0  # Ctrl-C may arrive before `advance` sets these numbers
         try:
@@ -288,8 +290,8 @@ class IntegrationLoop:
             self.code = INTERRUPTED
         except Exception as error:
             # A callback raised the exception. If it was called to sample forces ahead of a step, perhaps at a state
-            # that no motion reaches, continue without samples. Else end the run, and raise the exception again unless
-            # an event has ended the run before
+            # that no motion reaches, continue without samples. Else end the run. Its caller gets the exception, unless
+            # an event has ended the run before this step
             if run.clock[a.SAMPLES_MOTION] == 1.0 and not self.interrupts.n_signals:
                 run.clock[a.SAMPLES_MOTION] = self.control[a.SAMPLE_MOTION] = 0.0
             elif is_crossing and not run.system.called_in_python and not self.interrupts.n_signals:
@@ -305,7 +307,7 @@ class IntegrationLoop:
 
     @contextmanager
     def _deadline_timer(self) -> Iterator[None]:
-        """Return a context in which a timer stops machine code at the deadline, if a single step may take long."""
+        """Within this context, stop machine code at the deadline by a timer, if a single step may take long."""
         run, notes = self.run, self.run.work.notes
         if self.deadline == np.inf or (run.system.n_q <= SMALL_SYSTEM and not run.system.called_in_python):
             yield
@@ -335,13 +337,13 @@ class IntegrationLoop:
                 self.latest_chunks.pop(0)
 
     def _store_step_fields(self) -> None:
-        """Store the fields with one row per step (STEP_ARRAYS) of all steps whose fields are not stored yet."""
+        """Move data of steps from `self.step_parts` to the store: one array for each name in STEP_ARRAYS."""
         steps, self.step_parts = np.concatenate(self.step_parts), self.step_parts[:1]
         for name, values in step_fields(steps, self.counts).items():
             self.request.store.add(name, values)
 
     def _check_progress(self, steps: Array, in_crossing: bool, chunk_time: float) -> None:
-        """Choose how many steps the next chunk attempts; change `self.code` if the run stalls, or has to stop."""
+        """Choose the number of steps of the next chunk; set `self.code` if the run stalls, or must stop."""
         run, a = self.run, self.run.a
         h = steps[:, a.H]
         self.stiffness_monitor.add_steps(h)
@@ -362,7 +364,7 @@ class IntegrationLoop:
             self.code = INTERRUPTED
 
     def _choose_method(self, in_crossing: bool, n_steps: int) -> None:
-        """Change plan, controls or kit for the next steps if `self.code` requires it; then set the code to PAUSED."""
+        """If `self.code` says that the steps cannot continue, choose other steps, and set the code to PAUSED."""
         run, a = self.run, self.run.a
         if self.code == a.NEEDS_DENSE or run.may_succeed_in_other_form(self.code):
             run.change_form()
@@ -393,7 +395,7 @@ class IntegrationLoop:
                 self.kit = run.kit
 
     def _last_states(self) -> list[TimedState]:
-        """Return past states; the polynomial across a singular position begins at one of them. []: none is recorded."""
+        """Return states at which the polynomial across a singular position may begin; [] if none are recorded."""
         if not self.request.every_step:
             return []
         states: list[TimedState] = [(self.run.t0, self.start)]
@@ -404,7 +406,7 @@ class IntegrationLoop:
         return ends[-N_RECENT:] + states[-N_RECENT:]
 
     def _correct_last_state(self) -> None:
-        """Replace [q, v, a] in the last recorded state by the run's state, which the polynomial of a crossing gave."""
+        """Replace the last recorded [q, v, a] by the values at that time of a polynomial across a singular position."""
         run = self.run
         t, row = float(run.clock[run.a.T]), run.state[: 3 * run.system.n_q]
         self.recorder.correct_last_state(t, row)
@@ -412,7 +414,7 @@ class IntegrationLoop:
             self.latest_chunks[-1][1][-1, : len(row)] = row
 
     def _needs_substitute(self, in_crossing: bool) -> bool:
-        """Return whether steps became too small away from singular positions, and the plan has a substitute."""
+        """Return whether another method must take over, as steps became too small away from singular positions."""
         run, a = self.run, self.run.a
         is_too_small = self.code == a.STEP_TOO_SMALL and run.control[a.MAY_SWITCH] == 1.0
         return is_too_small and not in_crossing and run.work.notes[indices.NEARLY_SINGULAR] != 1.0
@@ -475,7 +477,7 @@ class IntegrationLoop:
         return record_of(Record, DEFAULTS | fields)
 
     def _suspicious_last_step(self, t: Array, table: Array) -> list[TimedState]:
-        """Return [state before the last step] if velocities jumped in that step, as at a singular position; else []."""
+        """Return [(t, state) before the last step] if velocities jumped in that step for no known reason; else []."""
         run = self.run
         if self.request.times is not None or self.recorder.end_event is not None:
             return []
@@ -484,7 +486,7 @@ class IntegrationLoop:
         return [(float(t[-2]), table[-2])] if has_velocity_jump_at_end(t, table, run.system.n_q) else []
 
     def _suspicious_outputs(self, t: Array, table: Array) -> list[TimedState]:
-        """Return all output states if the run passed near a singular position, and steps ended at them; else []."""
+        """Return all output states if the run passed near a singular position at one of them, else []; for a check."""
         run, request = self.run, self.request
         equal_steps = run.control[run.a.FIXED_STEP] > 0.0 and request.times is None
         if not run.passed_near_singular() or not (

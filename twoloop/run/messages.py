@@ -1,9 +1,9 @@
 """Monitor a run, and describe its end: status, message and advice.
 
-`StallDetector` detects a run that makes no progress. `StiffnessMonitor` samples states; after the run,
-`describe_stiffness` decides whether stability, not accuracy, limited the steps. At the sampled states, it estimates the
-rates of the fastest vibration and decay, by power iteration with dF/dq and dF/dv (F: accelerations). It compares each
-rate times the step size with the stability limit of the method.
+`StallDetector` detects a run that makes no progress. `StiffnessMonitor` stores some states of the run. After the run,
+`describe_stiffness` decides from them whether stability, not accuracy, limited the steps: at each of these states, it
+estimates the rates of the fastest vibration and decay, by power iteration with dF/dq and dF/dv (F: accelerations), and
+compares each rate times the step size with the stability limit of the method.
 """
 
 import sys
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 INTERRUPTED, STAGNATED, OUT_OF_TIME = -1, -2, -3  # end codes of a run, in addition to those that `advance` returns
-STAGNATION_STEPS = 20_000  # smallest number of accepted steps over which the mean step size is computed
+STAGNATION_STEPS = 20_000  # a run is checked for a stall once per (about) this number of accepted steps
 # A run stalls if its mean step size is below STAGNATION_PACE times its largest step and the rest of the run would take
 # more than STAGNATION_LEFT steps, or if the rest would take more than MAX_STEPS_LEFT steps (days of computing)
 STAGNATION_PACE, STAGNATION_LEFT, MAX_STEPS_LEFT = 1e-3, 1e7, 1e11
@@ -47,8 +47,8 @@ STAGNATION_PACE, STAGNATION_LEFT, MAX_STEPS_LEFT = 1e-3, 1e7, 1e11
 class StallDetector:
     """Monitor of the sizes of accepted steps, to detect a run that makes no progress.
 
-    A run is stalled if the rest of it, with the mean size of the last steps, takes more than `max_steps_left` steps. If
-    steps were much longer before, the limit is STAGNATION_LEFT steps.
+    From the mean size of the last steps follows how many steps the rest of the run takes. The run is stalled if these
+    are more than `max_steps_left`, or more than STAGNATION_LEFT if steps were much longer earlier in the run.
     """
 
     def __init__(self, t0: float, max_steps_left: float):
@@ -62,7 +62,7 @@ class StallDetector:
         self.window_n += len(h)
 
     def is_stalled(self, t: float, t1: float) -> bool:
-        """Return whether a run from t to t1 would take too many steps; check only every STAGNATION_STEPS steps."""
+        """Return whether the rest, from t to t1, takes too many steps; False if the last check was just before."""
         if self.window_n < STAGNATION_STEPS:
             return False
         self.mean_step = (t - self.window_t) / self.window_n
@@ -78,14 +78,15 @@ class StallDetector:
 MAX_SAMPLES = 8  # largest number of sampled states, spread about evenly over the run
 N_LAST_STEPS = 8  # number of steps before a sampled state; their median is the step size of the sample
 N_ITERATIONS = 6  # number of power iterations at each sampled state
-# a power iteration starts with the eigenvectors of the last sample plus INITIAL_FACTOR times `initial_direction`,
-# because a component of the new eigenvector that is zero in the first vector would stay zero
+# a power iteration starts with the eigenvector at the previous sample, to which INITIAL_FACTOR times a vector without
+# zeros (`initial_direction`) is added: a component that is zero at the start might stay zero
 INITIAL_FACTOR = 0.1
-# the dominant eigenvalue is negative if the cosine of the angle from a direction to its image is below -MIN_ALIGNMENT
+# in a power iteration x -> J x, the dominant eigenvalue of J is negative if cos(angle between x and J x) is below minus
+# this number
 MIN_ALIGNMENT = 0.9
 MIN_STEPS = 200  # after fewer accepted steps, a message does not mention stiffness
-# stability limited the steps if, over the samples, the median of h * rate / limit is at least this. `h`: step size;
-# `rate`: of the fastest vibration or decay; `limit`: largest stable h * rate. In smooth motion, the median is 0.4
+# stability limited the steps if the median, over all samples, of h * rate / limit is at least this; 0.4 is typical of
+# smooth motion. h: step size. rate: of the fastest vibration or decay. limit: largest h * rate with a stable method
 MIN_STABILITY_RATIO = 0.45
 
 
@@ -102,7 +103,7 @@ class StiffnessSample(NamedTuple):
 
 
 class StiffnessMonitor:
-    """Monitor that samples states of a run, so that `describe_stiffness` can decide whether stability limited steps."""
+    """Monitor that stores some states of a run, so that `describe_stiffness` can decide if stability limited steps."""
 
     def __init__(self, plan: Plan):
         self.plan, self.sampling_interval, self.n_calls, self.n_steps = plan, 1, 0, 0
@@ -116,7 +117,7 @@ class StiffnessMonitor:
         self.last_sizes = last if last.size == N_LAST_STEPS else np.concatenate([self.last_sizes, last])[-N_LAST_STEPS:]
 
     def sample_state(self, t: float, state: Array, n_q: int) -> None:
-        """Store the current state as a sample; in long runs, only at every second, fourth, eighth, ... call."""
+        """Store the current state as a sample. In long runs, most calls do nothing, so that samples stay few."""
         if self.plan.stable_to is None or self.last_sizes.size < N_LAST_STEPS:
             return
         self.n_calls += 1
@@ -131,7 +132,7 @@ class StiffnessMonitor:
 
 
 def describe_stiffness(monitor: StiffnessMonitor, kit: Any, work: Any) -> str:
-    """Return a sentence if stability limited the steps, else ""; overwrite the arrays in `work`."""
+    """Return a sentence for the message if stability limited the steps, else ""; arrays in `work` are overwritten."""
     if not monitor.samples or monitor.n_steps < MIN_STEPS:
         return ""
     initial = initial_direction(work.Q.size)
@@ -142,7 +143,7 @@ def describe_stiffness(monitor: StiffnessMonitor, kit: Any, work: Any) -> str:
             direction += INITIAL_FACTOR * initial
         try:
             vibration, decay = _fastest_rates(kit, work, sample, directions)
-        except Exception:  # raised by a callback at a displaced state, which is not a state of the run
+        except Exception:  # from a callback, at a displaced state that the run did not reach
             return ""
         h = sample.h
         samples.append((h * vibration / sample.vibration, h * decay / sample.decay, vibration, decay, h))
@@ -171,10 +172,10 @@ def _fastest_rates(kit: Any, work: Any, sample: StiffnessSample, directions: lis
 def _dominant_eigenvalue(
     kit: Any, work: Any, sample: StiffnessSample, direction: Array, independent: NDArray[np.int64], by_v: bool
 ) -> tuple[float, bool]:
-    """Return the magnitude of the dominant eigenvalue of dF/dq (`by_v`: dF/dv), and whether it is negative.
+    """Return |dominant eigenvalue| of dF/dq, or of dF/dv if `by_v`, and whether it is negative, by power iteration.
 
-    F: accelerations of the independent coordinates, whose indices are `independent`. The power iteration begins with
-    `direction`, and overwrites it by the eigenvector.
+    F: accelerations of the independent coordinates, whose indices are `independent`. `direction`: first vector of the
+    iteration, overwritten by the eigenvector.
     """
     from twoloop.kernels.evaluation import tasks
 
@@ -197,8 +198,8 @@ def _dominant_eigenvalue(
     return eigenvalue, is_negative
 
 
-# messages call C_q nearly singular if its smallest singular value is at most this fraction of its largest one, and
-# mention missing inertia if this holds for the eigenvalues of M on the velocities that the constraints allow
+# messages call C_q nearly singular if its smallest singular value is at most this fraction of its largest one. They say
+# that inertia is missing if the same holds for the eigenvalues of M on the velocities that the constraints allow
 MAX_SINGULAR_RATIO = 1e-3
 # a result is not trusted if rounding errors of velocities (or accelerations) exceed this multiple of the tolerances
 MAX_LASTING_ERROR = 100.0
@@ -223,10 +224,10 @@ _FAILURE_REASONS = {
 
 
 def message_of(run: "Run", text: str, system: "ConstrainedSystem") -> dict[str, Any]:
-    """Return {"message": text}, or {"later": function} with a function that computes the text when it is read.
+    """Return {"message": text}, or {"later": function} if the text will be computed when it is first read.
 
-    A text that describes crossed singular positions is computed later, because this takes longer than many runs. Until
-    then `system` must not change, but the arrays of the run may.
+    To describe the singular positions that the run crossed takes longer than many runs: so such a text is computed
+    later. Until then `system` must not change, but the arrays of the run may.
     """
     if CROSSINGS_MARK not in text:
         return {"message": text}
@@ -242,11 +243,11 @@ def message_of(run: "Run", text: str, system: "ConstrainedSystem") -> dict[str, 
 def reject_velocity_jumps(
     run: "Run", last_step: list[TimedState], output_states: list[TimedState], end: float, status: Status, message: str
 ) -> tuple[Status, str]:
-    """Check whether rounding, or a change of branch, has changed velocities near a singular position.
+    """Withdraw the success of a run if rounding, or a change of branch, changed velocities near a singular position.
 
-    If so, return RANK_LOST and a message with the reason, else return `status` and `message`. `last_step`: [state
-    before the last step] if velocities jumped in this step, else []. `output_states`: other states to check. Only
-    states before `end` are checked.
+    Then return RANK_LOST and a message with the reason, else return `status` and `message`. Checked are the states
+    beside crossed positions, `last_step` ([state before the last step] if velocities jumped in it, else []), and
+    `output_states`, as far as they are before the time `end`.
     """
     end_state, crossings = (float(run.clock[run.a.T]), run.state), [each for each in run.crossings if each[0][0] < end]
     reason = describe_rounding(run, [*(state for ends in crossings for state in ends), *output_states], end)
@@ -259,9 +260,9 @@ def reject_velocity_jumps(
 
 
 def describe_rounding(run: "Run", states: list[TimedState], end: float) -> str:
-    """Describe the earliest of `states` whose v has a rounding error of more than MAX_LASTING_ERROR tolerances.
+    """Find the earliest of `states` where rounding changes v by more than MAX_LASTING_ERROR tolerances.
 
-    Return a sentence; "" if there is no such state. Only states before the time `end` are checked.
+    Return a sentence about it, or "" if there is none. States at or after the time `end` are not checked.
     """
     system, n = run.system, run.system.n_q
     for t, state in sorted({each[0]: each for each in states}.values(), key=itemgetter(0)):
@@ -369,7 +370,7 @@ def _describe_stall(run: "Run", t1: float, stall: StallDetector) -> str:
 
 
 def _describe_contradiction(run: "Run") -> str:
-    """Return the message of a run that stopped because a redundant row is violated or no branch leaves the start."""
+    """Return the message of a run that stopped as a redundant row was violated, or its start has no certain branch."""
     t, q = float(run.clock[run.a.T]), run.state[: run.system.n_q]
     if run.starts_singular:
         return (
@@ -388,7 +389,7 @@ def _describe_contradiction(run: "Run") -> str:
 
 
 def warn_of_singular_end(run: "Run") -> str:
-    """Warn if the constraints have lost rank, or nearly so, at the end; return the warning as a sentence, else ""."""
+    """Warn if the constraints lose rank, or nearly so, at the end of a run; return the warning, "" if they do not."""
     if not run.passed_near_singular():
         return ""
     system, n, t = run.system, run.system.n_q, float(run.clock[run.a.T])
@@ -442,7 +443,7 @@ def warn_user(text: str) -> str:
 
 
 def _velocity_error_ratio(run: "Run", t: float, q: Array, v: Array) -> float:
-    """Return the largest estimated error of velocities due to rounding of positions, divided by the tolerance."""
+    """Return the largest estimated error of v due to rounding of positions, divided by the tolerance of v."""
     allowed = run.tolerances[indices.ATOL :] + run.rtol * np.abs(v).max()
     return float((velocity_rounding_errors(run.system, t, q, v, run.rank) / allowed).max())
 
@@ -453,7 +454,7 @@ def _ratio_text(run: "Run", t: float, q: Array) -> str:
 
 
 def _describe_near_end(run: "Run", t1: float) -> str:
-    """Return a sentence if the run stopped so near t1 that t1 may have prevented a crossing; else ""."""
+    """Return a sentence if a run stopped so near its end t1 that no step across a singular position fits; else ""."""
     time_left = t1 - float(run.clock[run.a.T])
     if time_left > max(NEAR_END * (t1 - run.t0), float(run.clock[run.a.H_LONG])):
         return ""
@@ -461,7 +462,7 @@ def _describe_near_end(run: "Run", t1: float) -> str:
 
 
 def _describe_near_singular(run: "Run", t1: float) -> str:
-    """If C_q is close to losing rank at the last state, return sentences on this position; else ""."""
+    """If the last state is near a singular position, return sentences that describe this position, else ""."""
     ratio = singular_ratio(run.system, float(run.clock[run.a.T]), run.state[: run.system.n_q], run.rank)
     if ratio > MAX_SINGULAR_RATIO:
         return ""

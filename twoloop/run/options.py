@@ -1,4 +1,4 @@
-"""Validate the options of a call of `solve_dae`; equal options have the same key, by which integrators are cached."""
+"""Validate the options of a call of `solve_dae`; calls with equal options can use the same cached integrator."""
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -14,12 +14,12 @@ from twoloop.methods.presets import PRESETS, Compiled, check_compiled, identity,
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.run import Run
 
-SMALLEST_TOLERANCE = 1e-15  # rtol and atol must not both be smaller: rounding would hide the error of a step
+SMALLEST_TOLERANCE = 1e-15  # rtol or atol must be at least this; else rounding would hide the errors of steps
 
 
 @lru_cache(maxsize=1024)
 def _unique_key(*_: Any) -> object:
-    """Return the same object whenever the arguments are equal; as a key of a dict, it is found faster than a tuple."""
+    """Return the same object whenever the arguments are equal: a dict finds such a key faster than a tuple of them."""
     return object()
 
 
@@ -46,12 +46,12 @@ class Options:
 
     @cached_property
     def own_tolerance(self) -> float | None:
-        """Tolerance that replaces rtol and atol in a method with its own error test (Newmark), else None."""
+        """Tolerance of a method with its own error test (Newmark), which ignores rtol and atol; else None."""
         return getattr(self.method, "error_tol", None)
 
     @cached_property
     def metadata(self) -> dict[str, Any]:
-        """Fields `method` and `rtol` of a result; also `untested` = None if all steps test errors of v."""
+        """Fields `method` and `rtol` of a result; and `untested` = None if no step leaves errors of v untested."""
         tested = getattr(self.method, "tested", "all")
         return {"method": self.method.name, "rtol": self.rtol} | ({} if tested == "positions" else {"untested": None})
 
@@ -62,7 +62,7 @@ class Options:
             run.set_step_sizes(self.first_step, self.max_step, t1)
 
 
-NO_OPTIONS: Any = (None,) * 12, None  # what is stored before the first call: arguments and options
+NO_OPTIONS: Any = (None,) * 12, None  # arguments and options of the last call, before the first call
 
 
 def options_of(

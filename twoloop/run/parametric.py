@@ -1,8 +1,8 @@
 """Use one run for many systems that differ only in their parameters.
 
-All numbers that depend on parameters are in arrays, which are filled anew for the next system. Then choices that depend
-on these numbers, such as pivots, are checked again, and callbacks are compared with their traces near the start. After
-the run, callbacks and traces are compared where states or parameters are outside the region of earlier comparisons.
+For each system, the arrays of numbers that depend on parameters are filled anew. Then choices that depend on these
+numbers, such as pivots, are checked again. Callbacks are compared with their traces (recorded operations): near the
+start, and after the run at states or parameters outside the region of earlier comparisons.
 """
 
 import copy
@@ -37,8 +37,8 @@ class SharedSetup:
 
     `run`: run of one of the systems, at its start; copies of this run are integrated. `code`: the generated code that
     the run calls; it was generated for `method`, `fixed` (whether the step size is constant) and `compiled`. Raise
-    ValueError if setup cannot be shared: the system is large, a callback may branch on its parameters, or numbers in
-    the plan differ from the values of their traced expressions.
+    ValueError if setup cannot be shared: the system is large, a callback may branch on its parameters, or a number in
+    the plan cannot be computed from the parameters by the expressions that traces contain.
     """
 
     def __init__(self, run: Run, code: GeneratedCode | None, method: Method, fixed: bool, compiled: Compiled):
@@ -66,12 +66,12 @@ class SharedSetup:
             raise ValueError("its numbers differ from the values of the traced expressions")
 
     def region(self, with_derivatives: bool) -> CheckedRegion:
-        """Return the region where runs have compared callbacks and, if `with_derivatives`, their derivatives."""
+        """Return the region of states where runs have compared callbacks (and derivatives, if asked) with traces."""
         return self._regions.setdefault(with_derivatives, CheckedRegion())
 
 
 class ParametricRun:
-    """Run that integrates one system after another: `use_parameters_of` writes a system's parameters to its arrays.
+    """Run that integrates systems one after another; they differ only in parameters, see `use_parameters_of`.
 
     `run`: a copy of the run in `shared`, at its start. `current_system`: the system whose parameters the arrays contain
     now. `system`: a copy of `current_system` that uses these arrays, and has a cache of its own.
@@ -114,7 +114,10 @@ class ParametricRun:
             traced.is_trusted = False
 
     def callbacks_agree(self, t0: float, q: Array, v: Array, t1: float, mass: Array, with_derivatives: bool) -> bool:
-        """Return whether callbacks agree with traces near the start, and `mass` is definite or diagonal as before."""
+        """Return whether callbacks agree with traces near the start, and M has the same structure as before.
+
+        The structure of M (at the start: `mass`) is whether it is definite, and whether it is diagonal.
+        """
         run, system = self.run, self.system
         if not self._mass_agrees:
             system.remember_at("definite mass", None, is_definite(mass))
@@ -129,7 +132,7 @@ class ParametricRun:
         return self._mass_agrees
 
     def _replace_arrays(self, plan: Plan) -> Plan:
-        """Return a copy of a plan whose arrays of expressions are replaced by arrays of their values (numbers)."""
+        """Return a copy of a plan with arrays of numbers, for the current parameters, instead of expressions."""
         array, values = self._expression_arrays.array, vars(plan)
         changes: dict[str, Any] = {name: array(values[name]) for name in NUMBER_FIELDS if values[name] is not None}
         changes |= {name: self._replace_arrays(values[name]) for name in PLAN_FIELDS if values[name] is not None}

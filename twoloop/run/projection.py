@@ -1,7 +1,7 @@
 """Project a guess onto the constraints (`consistent_state`); report how far the guess moved, and its assembly.
 
-Large systems are projected by sparse factors, except in three cases: rows of C_q are dependent at consistent positions,
-but only nearly dependent at the guess; a dead centre is near; the guess may lead to another assembly.
+Large systems are projected by sparse factors, but by dense ones in three cases: rows of C_q are dependent at consistent
+positions, but only nearly dependent at the guess; a dead centre is near; the guess may lead to another assembly.
 """
 
 from __future__ import annotations  # so that help() shows the name ArrayLike
@@ -29,16 +29,16 @@ from twoloop.run.workspace import fixed_order_form, make_kit, workspace
 
 Array = NDArray[np.float64]
 
-MIN_SINE = 1e-5  # a dead centre is near if the sine of the angle from a row of C_q to the span of the others is smaller
+MIN_SINE = 1e-5  # a dead centre is near if sin(angle between a row of C_q and the span of other rows) is below this
 # MAX_CORRECTIONS: largest number of Newton iterations; they end when a correction is at most ROUNDING times max|q|
 MAX_CORRECTIONS, ROUNDING = 25, 1e-14
-# C_q predicts, to first order, the projection of a displaced guess. The guess leads to the same assembly if prediction
-# and projection differ by at most this fraction of the displacement
+# C_q predicts, to first order, where a displaced guess is projected. If this is wrong by more than this fraction of the
+# displacement, the guess may lead to another assembly
 MAX_NONLINEARITY = 0.5
 
 
 class _SparseProjection:
-    """Projection onto the constraints by the least change, in the fixed-order form with a unit matrix in place of M."""
+    """Least-change projection of a large system onto constraints, by the fixed-order form with M = unit matrix."""
 
     def __init__(self, system: ConstrainedSystem, t: float, q: Array, form: Any, rank: int | None = None):
         self.system, self.t, self.rank = system, t, rank
@@ -56,7 +56,7 @@ class _SparseProjection:
         return int(entry_point(self.kit.inner)(self.kit, self.work, task, self.t, q, v, 0.0, a, lam))
 
     def allowed_part(self, displacement: Array) -> Array:
-        """Return the component (n_q,) of a displacement that the constraints at `self.position` allow."""
+        """Return the displacement (n_q,) without the component that would violate C_q at `self.position`."""
         rows = self.system.sparse_rows(self.t, self.position)
         change = np.zeros(len(displacement))
         zero, residual = np.zeros(len(displacement)), np.ascontiguousarray(rows @ displacement)
@@ -64,9 +64,10 @@ class _SparseProjection:
         return displacement - change
 
     def project_nearby(self, q: Array) -> Array | None:
-        """Return q projected by the independent rows of C_q; None on failure, or if the other constraints are violated.
+        """Return q projected onto the independent constraints; None on failure, or if other constraints are violated.
 
-        The independent rows are those of the last choice: off the constraints, the other rows are not quite dependent.
+        Which rows of C_q are independent is known from the last `RENEW_PARTITION`, at a consistent position: away from
+        the constraints, redundant rows are not quite dependent.
         """
         zero, change = np.zeros(len(q)), np.zeros(len(q))
         for _ in range(MAX_CORRECTIONS):
@@ -98,9 +99,9 @@ class Dependence(NamedTuple):
     """Rank of C_q of a large system at a position, and the rows that depend on others."""
 
     rank: int
-    coefficients: dict[int, Array]  # keys: dependent rows; values: arrays x (n_c,) with row = x @ independent rows
-    allowed_move: Array  # displacement (n_q,) that C_q allows; its largest entry is 1 in units of coordinates
-    project_nearby: Callable[[Array], Array | None]  # function that projects a position near q; None: failed
+    coefficients: dict[int, Array]  # for each dependent row: x (n_c,) with row = x @ C_q, 0 at dependent rows
+    allowed_move: Array  # random displacement (n_q,) that C_q allows; its largest entry is 1 unit of a coordinate
+    project_nearby: Callable[[Array], Array | None]  # projects a position near q; returns None on failure
 
 
 def dependence(system: ConstrainedSystem, t: float, q: Array) -> Dependence | None:
@@ -163,10 +164,11 @@ def project_sparsely(
 
 
 def _nearby_guesses_match(projection: _SparseProjection, position: Array, change: Array) -> bool:
-    """Return whether the linearized constraints predict where three guesses near `position` are projected.
+    """Return whether three guesses near a projected `position` lead to the same assembly as the user's guess.
 
-    The guesses are displaced from `position` by -2 `change`, and by two random vectors of at most max|change|. If the
-    prediction fails for one, there may be another assembly as near to `position` as the user's guess.
+    `change`: displacement of the user's guess by its projection. The guesses are displaced from `position` by -2
+    `change`, and by two random vectors of at most max|change|. They lead to the same assembly if the linearized
+    constraints predict where they are projected.
     """
     distance = float(np.abs(change).max())
     directions = np.random.default_rng(8).uniform(-1.0, 1.0, (2, len(position)))
@@ -182,15 +184,16 @@ def _nearby_guesses_match(projection: _SparseProjection, position: Array, change
 
 
 MAX_ITERATIONS = 50  # largest number of Gauss-Newton iterations
-# the iteration ends if the violation is at most this fraction of the violation that is allowed at a start, and the last
-# step has not halved it
+# the iteration ends if the violation is at most this fraction of the one allowed at a start, and has not been halved by
+# the last step (rounding prevents a smaller one)
 CONVERGED_VIOLATION = 1e-2
-# singular values count as zero if they are below this fraction of the largest one: RANK_CUTOFF for ranks, LSTSQ_CUTOFF
-# for least-squares solutions, REDUNDANT_CUTOFF for least-squares solutions with redundant rows
+# singular values of C_q count as zero below these fractions of the largest one. RANK_CUTOFF: to determine ranks.
+# LSTSQ_CUTOFF: in least-squares solutions. REDUNDANT_CUTOFF: in least-squares solutions with redundant rows
 RANK_CUTOFF, LSTSQ_CUTOFF, REDUNDANT_CUTOFF = 1e-10, 1e-13, 1e-2
 # a dead centre is near if the ratio of the smallest to the largest singular value of C_q is at most this
 DEAD_CENTRE_RATIO = 0.01
-# two positions count as equal if their distance is at most this fraction of the largest change by the projection
+# two projected guesses end at the same position if their distance is at most this fraction of the largest change that
+# the projection has made
 MAX_EQUAL_DISTANCE = 0.1
 MAX_CHANGE = 1e8  # the iteration has diverged if a coordinate changes by more than this, in its unit (`Scales.columns`)
 
@@ -293,7 +296,7 @@ def consistent_state(
 def _project_state(
     system: ConstrainedSystem, t: float, guess: Array, speeds: Array, kept: list[int], check_assembly: bool
 ) -> ConsistentState:
-    """Return the projected state, still without `moved_q` and `moved_v`."""
+    """Project a guess (positions and velocities `speeds`); return the state, still without `moved_q` and `moved_v`."""
     free = np.array([j for j in range(system.n_q) if j not in kept], dtype=int)
     check_bounds(system, t, guess, speeds)
     system.check_returned(t, guess, speeds)
@@ -338,7 +341,10 @@ class _LargeState(ConsistentState):
 def _projected_position(
     system: ConstrainedSystem, t: float, guess: Array, free: NDArray[np.intp], kept: list[int], check_assembly: bool
 ) -> Array:
-    """Project a guess by changing its `free` coordinates; raise if that fails, or another assembly may be as near."""
+    """Return a guess projected by changes of its `free` coordinates; raise ValueError on failure.
+
+    It is also a failure if another assembly may be as near as the projected position.
+    """
     jacobian = system.jacobian(t, guess)
     scales = scales_of(system, t, guess, jacobian)
     scaled = scales.scaled(jacobian)
@@ -379,11 +385,12 @@ def _projected_position(
 def _describe_other_assembly(
     system: ConstrainedSystem, t: float, q1: Array, guess: Array, free: NDArray[np.intp], scales: Scales, cutoff: float
 ) -> str | None:
-    """Project other guesses, as far from the position `q1` as `guess`; describe one that leads to another assembly.
+    """Check whether guesses as far from the projected position q1 as `guess` may lead to another assembly.
 
-    Return None if there is none. A guess leads to the same assembly if its projection is near the point that C_q
-    predicts to first order, and the determinant of the dependent columns keeps its sign. Two assemblies may differ in
-    the dependent coordinates alone.
+    Return None if they do not, else a phrase on a guess that may. A guess leads to the same assembly if it is projected
+    to about the point that C_q predicts to first order, and the determinant of the dependent columns keeps its sign. If
+    not, q1 is reconstructed from the result: if another position with the same independent coordinates is found, it is
+    on another assembly.
     """
     scaled_move = (q1 - guess) / scales.columns
     largest_move = float(np.abs(scaled_move).max())
@@ -407,8 +414,8 @@ def _describe_other_assembly(
         expected = q1 + displacement + _least_change(jacobian, free, -(jacobian @ displacement), cutoff)
         if distance(projected, expected) <= MAX_NONLINEARITY * float(np.abs(move).max()) and sign_at(projected) == sign:
             continue
-        # perhaps only the curvature of the constraints makes the prediction inaccurate. Then a guess with the dependent
-        # coordinates of `projected` and the other coordinates of q1 is projected back to q1
+        # the prediction may be inaccurate only because constraints are curved. Then q1 with the dependent coordinates
+        # of `projected` is projected back to q1; on another assembly, it stays there
         mixed = q1.copy()
         mixed[dependent_columns] = projected[dependent_columns]
         mixed_projected, excess, _ = _gauss_newton(system, t, mixed, np.array(dependent_columns, dtype=int), cutoff)
@@ -420,7 +427,7 @@ def _describe_other_assembly(
 
 
 def _describe_change(before: Array, after: Array, scales: Scales) -> str:
-    """Describe the change of the coordinate that changes most, with enough digits of both values to show the change."""
+    """Describe the largest change of a coordinate, with enough digits of both values to show that they differ."""
     j = int(np.abs((after - before) / scales.columns).argmax())
     magnitude, change = max(abs(float(before[j])), abs(float(after[j]))), abs(float(after[j] - before[j]))
     digits = min(17, 3 + max(0, math.ceil(math.log10(magnitude / change)))) if change > 0.0 else 3
@@ -430,7 +437,10 @@ def _describe_change(before: Array, after: Array, scales: Scales) -> str:
 def _gauss_newton(
     system: ConstrainedSystem, t: float, q: Array, free: NDArray[np.intp], cutoff: float = LSTSQ_CUTOFF
 ) -> tuple[Array | None, float, int]:
-    """Return the projected q (None: diverged), violation / allowed violation at this q, number of iterations."""
+    """Change the `free` entries of q until it is consistent, by the Gauss-Newton method.
+
+    Return q (None: diverged), (violation / allowed violation) of q, and the number of iterations.
+    """
     least_excess, best_q, guess = np.inf, q, q
     for iteration in range(1, MAX_ITERATIONS + 1):
         try:
@@ -483,7 +493,7 @@ def _identify_assembly(scaled: Array, free: NDArray[np.intp]) -> tuple[tuple[int
 
 
 def _weakest_direction(scaled: Array, free: NDArray[np.intp]) -> Array:
-    """Return the right singular vector x (n_q,) of the scaled C_q to its least nonzero singular value; max|x| = 1."""
+    """Return the right singular vector (n_q,) of the smallest nonzero singular value of the scaled C_q; max|x| = 1."""
     values, rows = np.linalg.svd(scaled[:, free], full_matrices=False)[1:]
     nonzero = values > RANK_CUTOFF * values.max()
     direction = np.zeros(scaled.shape[1])
@@ -492,7 +502,7 @@ def _weakest_direction(scaled: Array, free: NDArray[np.intp]) -> Array:
 
 
 def _describe_rank_loss(scales: Scales, jacobian: Array, free: NDArray[np.intp], kept: list[int]) -> str:
-    """Return a sentence if C_q nearly loses rank, both as it is and with scaled rows and columns; else ""."""
+    """Return a sentence if C_q nearly loses rank in any units (also with scaled rows and columns), else ""."""
     if jacobian[:, free].size == 0:
         return ""
     values = [np.linalg.svd(each[:, free], compute_uv=False) for each in (jacobian, scales.scaled(jacobian))]

@@ -123,14 +123,14 @@ class OutputRequest(NamedTuple):
     """Requested output of a run."""
 
     times: Array | None = None  # output times; None: the ends of all accepted steps
-    ends_at_outputs: bool = False  # whether steps end at all output times, so that output needs no interpolation
+    ends_at_outputs: bool = False  # whether steps end at all output times; if not, states there are interpolated
     dense: bool = False  # whether dense output, `result.sol`, is requested
     events: list[Event] | None = None  # events to be searched for; None: no events were requested
     store: Any = None  # `MemoryStore` or `FileStore` to which the output is added; None: a new MemoryStore
 
     @property
     def interpolated_times(self) -> Array | None:
-        """Output times at which states must be interpolated, or None."""
+        """Output times, if states there must be interpolated; None if steps end at all of them, or there are none."""
         return None if self.ends_at_outputs else self.times
 
     @property
@@ -145,10 +145,10 @@ class OutputRequest(NamedTuple):
 
 
 class Recorder:
-    """Recorder of the states of accepted steps, chunk by chunk.
+    """Recorder of the states of accepted steps, which it receives in chunks (steps of one call of compiled code).
 
-    A step is searched for events once all states that its polynomials interpolate are known. So chunks do not matter.
-    Event functions are evaluated at least every `max_gap` seconds.
+    A step is searched for events only when later states that its polynomial interpolates are known, too: so results do
+    not depend on the size of chunks. Event functions are evaluated at least every `max_gap` seconds.
     """
 
     def __init__(
@@ -164,10 +164,10 @@ class Recorder:
         self.n_steps = 0  # number of steps searched for events so far; the last one may contain a terminal event
         self.last_step_size = 0.0  # time (s) from the beginning of the run's last step to the terminal event
         self.interrupted = False  # whether Ctrl-C interrupted the search for events, or the interpolation
-        # states at the ends of intervals still to be searched, and earlier states that their polynomials interpolate
+        # pending states: ends of intervals not searched for events yet, and earlier states on the same polynomials
         self._t, self._rows = np.array([t0]), state[None, :].copy()
         self._kinds = np.empty(0, dtype=np.int64)
-        self._next_interval = 0  # index, in `_t` and `_kinds`, of the first interval that is still to be searched
+        self._next_interval = 0  # index in `_kinds` of the first interval that is not searched yet
         self._n_outputs = 0
         may_end_run = request.events is not None and any(event.terminal < np.inf for event in request.events)
         self._max_pending = 0 if may_end_run or request.store.append_only else MAX_PENDING_STATES
@@ -215,7 +215,7 @@ class Recorder:
             store.add("sol_kinds", kinds)
 
     def _store_states(self, t: Array, rows: Array) -> None:
-        """Store times and rows [q, v, a, lam], or rows [q, v], to which `_complete_rows` adds [a, lam] now or later."""
+        """Store times and rows [q, v, a, lam]; [a, lam] may be missing from interpolated rows, and is added later."""
         self.request.store.add("t", t)
         self.request.store.add("states", self._complete_rows(t, rows) if self.request.store.append_only else rows)
 
@@ -228,7 +228,7 @@ class Recorder:
 
     @property
     def interrupted_at(self) -> float | None:
-        """Time reached when Ctrl-C interrupted the search for events, or None; the result ends at this time."""
+        """Time at which the result ends because Ctrl-C interrupted the search for events; None if it did not."""
         ended_early = self.interrupted and self.search is not None and self.end_event is None
         return self.search.reached if ended_early and self.search is not None else None
 
@@ -496,7 +496,7 @@ class Record:
 
 
 def record_of(kind: type[AnyRecord], fields: dict[str, Any]) -> AnyRecord:
-    """Return a record with the attributes `fields`; faster than the constructor of such a large frozen dataclass."""
+    """Return a record with the attributes `fields`. The constructor of this large frozen dataclass would be slower."""
     instance = _new_object(kind)
     _set_fields(instance, fields)
     return instance
@@ -506,7 +506,7 @@ _new_object, _set_fields = object.__new__, vars(Record)["__dict__"].__set__
 
 
 class _Deferred:
-    """Descriptor of a field of a record: if it is missing, `vars(record)["later"]` computes it at the first access."""
+    """Descriptor of a field of a record: at its first access, compute a missing value by `vars(record)["later"]`."""
 
     def __init__(self, name: str):
         self.name = name
@@ -520,7 +520,7 @@ class _Deferred:
 
 
 DEFAULTS = {each.name: each.default for each in fields(Record) if each.default is not MISSING}
-for _field in fields(Record):  # here, because within the class, `dataclass` would take a descriptor for a default
+for _field in fields(Record):  # not in the class: `dataclass` would use it as a default value
     setattr(Record, _field.name, _Deferred(_field.name))
 
 
@@ -528,13 +528,16 @@ Integers = NDArray[np.int64]
 
 COUNT_NAMES = [each.name for each in fields(Statistics) if each.name != "cpu_time"]
 GET_COUNTS = itemgetter(*(getattr(indices, name.upper()) for name in COUNT_NAMES))
-# totals before the first step: steps rejected by the error test, steps rejected because an iteration did not converge,
-# and partitions (the first one is chosen at the start)
+# three counts before the first step: steps rejected by the error test; steps rejected as an iteration did not converge;
+# partitions (one, as the first is chosen at the start)
 INITIAL_COUNTS = np.array([0, 0, 1])
 
 
 def step_fields(steps: Array, counts: Integers) -> dict[str, NDArray[Any]]:
-    """Return the fields with one row per step; `counts`: totals before these steps, on return after these steps."""
+    """Return the fields with one row per step, such as the step size h, from rows of steps that kernels store.
+
+    `counts`: the three counts of INITIAL_COUNTS before these steps; on return, after these steps.
+    """
     n = len(steps)
     h, changes, untested = np.empty(n), np.empty((3, n), dtype=np.int64), np.empty(n, dtype=np.bool_)
     entry_point(cached_run().split_steps)(steps, counts, h, changes, untested)
@@ -553,7 +556,7 @@ def state_fields(n: int, t: Array, table: Array) -> dict[str, Array]:
 
 
 def interval_kinds(run: "Run", steps: Array) -> Integers:
-    """Return, for dense output, the kind of the interval of each of `steps` (rows of steps by the run's own plan)."""
+    """Return the kind of each step of the run's own method: a code that says which data dense output interpolates."""
     if run.plan.separate:
         return np.full(len(steps), indices.SEPARATE)
     explicit_kind = indices.ACROSS if run.substituted else indices.ACCELERATIONS

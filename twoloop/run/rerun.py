@@ -27,12 +27,12 @@ from twoloop.run.run import Run
 
 Array = NDArray[np.float64]
 
-FIRST_FORCE = "first force"  # key in `system.derived` of the force at the start, if `force` is compiled but not traced
+FIRST_FORCE = "first force"  # `system.derived` has the force at the start under this key, if `force` is not traced
 N_DERIVATIVES = 4  # number of states of a run at which derivatives are checked after the run, including the last state
 
 
 def checked_region_of(run: Run, check_derivatives: bool) -> CheckedRegion:
-    """Return the region of states where earlier runs of the system compared its callbacks with this run's traces."""
+    """Return the region of states where earlier runs compared callbacks with their traces (recorded operations)."""
     if run.region is not None:
         return run.region
     key = (check_derivatives, *map(id, run.traced))  # the system keeps the traces, so that their ids stay unique
@@ -49,15 +49,15 @@ def check_callbacks_along_run(
     is_due: bool,
     is_inside: bool = False,
 ) -> tuple[Status, str]:
-    """Compare callbacks with their traces at states of a run that ended at `end`; return a status and a message.
+    """After a run, compare callbacks with their traces at states of the run; return its final status and message.
 
     If all callbacks are right, return `status` and `message`; else another status, and a message that begins with the
     difference. Python forces are called twice, and must return the same value. If `check_derivatives`, derivatives are
-    compared with exact ones, or with finite differences.
+    compared with exact ones, or with finite differences. `end`: time at which the run ended.
 
-    `states(all_states)`: function that returns states [t, q, v], latest first; argument: whether all will be compared.
-    `is_due`: True: compare at all of these states; False: skip states in the region of earlier comparisons, see
-    `CheckedRegion`. `is_inside`: whether the whole run is in this region.
+    `is_due`: if True, compare at all states that `states(True)` returns (rows [t, q, v], latest first). If False,
+    compare only at those of `states(False)` outside the region of earlier comparisons, see `CheckedRegion`.
+    `is_inside`: whether the whole run is in this region.
     """
     if changed := describe_changed_force(run):
         return Status.WRONG_TRACE, f"{changed} {message}"
@@ -134,7 +134,10 @@ def python_functions(system: ConstrainedSystem) -> PythonFunctions | None:
 
 
 def first_force(system: ConstrainedSystem, t0: float, q0: Array, v0: Array) -> tuple[Any, Array] | None:
-    """Return ((t0, q0, v0), force there) if the force is compiled; else forget earlier force samples, return None."""
+    """Return ((t0, q0, v0), compiled force there) for `describe_changed_force`; None if it fails.
+
+    Also None if the force is a Python function: the samples of its calls, kept for the same check, begin anew.
+    """
     if functions := python_functions(system):
         functions.restart()
         return None
@@ -144,7 +147,7 @@ def first_force(system: ConstrainedSystem, t0: float, q0: Array, v0: Array) -> t
 
 
 def describe_changed_force(run: Run) -> str | None:
-    """Describe the error if the force now differs from an earlier value for equal arguments; None: no error.
+    """After a run, call the force with the same arguments as before or in the run; describe a difference, else None.
 
     Two calls after the run would not reveal a force that changes slowly (with the clock) or once (after 1000 calls).
     """
@@ -180,12 +183,12 @@ def _change_text(name: str, t: float, entry: int, first_value: float, second_val
 
 
 CHUNK_ATTEMPTS = 256  # largest number of attempted steps in one call of `advance`
-FIRST_FRACTION = 0.1  # first step size / duration of a piece, unless the piece before has proposed a step size
+FIRST_FRACTION = 0.1  # first step size / duration of a piece; a later piece begins with the last proposed step size
 MAX_BUFFER_SIZE = 100_000  # largest number of floats in the buffer of states
 
 
 class RerunPiece(NamedTuple):
-    """Rerun of a piece of a run: rows [q, v] at the requested times, largest step size (s), and number of steps."""
+    """Result of a rerun of a piece: rows [q, v] at the requested times, largest step size (s), number of steps."""
 
     states: Array
     longest: float
@@ -193,7 +196,7 @@ class RerunPiece(NamedTuple):
 
 
 class IndependentRerun:
-    """Integrator that reruns pieces of a run with another method; each piece starts from a state of the run.
+    """Integrator that reruns pieces of a run with another method, to check it; a piece starts at a state of the run.
 
     (t, q, v): any state of the run, to set up the arrays. `method`: "explicit" for `DOP853`; for stiff pieces
     "all" or "positions", a Radau method whose error test includes all components, or only positions.
@@ -227,7 +230,7 @@ class IndependentRerun:
         self.next_step = np.inf
 
     def integrate(self, t0: float, state: Array, times: Array, max_attempts: int) -> RerunPiece | None:
-        """Integrate from a state [q, v] at t0 to all `times`; None: failure, or no end after about `max_attempts`."""
+        """Integrate from a state [q, v] at t0 to all `times`; None: failed, or more than about `max_attempts` steps."""
         run, a, n = self.run, self.run.a, len(state)
         proposed_step, self.next_step = self.next_step, np.inf
         if run.restart(t0, state[: n // 2], state[n // 2 :]) != indices.DONE:

@@ -40,19 +40,19 @@ from twoloop.run.workspace import add_newton_program, fixed_order_form, kit_for_
 Array = NDArray[np.float64]
 Buffers = tuple[Array, Array, Array]  # times, states and steps
 
-# largest number of attempted steps in the first chunk (call of compiled code) of a small system. With fewer, the checks
-# after each chunk cost more: they take 0.2 ms in Python
+# largest number of attempted steps in the first chunk (call of compiled code) of a small system. After each chunk,
+# checks in Python take 0.2 ms, a large part of the time of a shorter chunk
 FIRST_CHUNK = 1024
 FIRST_CHUNK_IN_PYTHON = 64  # value of FIRST_CHUNK if callbacks are Python functions, which are slow
 SMALL_SYSTEM = 32  # largest number of coordinates of a small system; larger systems have proportionally smaller chunks
-TRIAL_STEPS = 10  # a method that is fast only with long steps is replaced if one of its first 10 steps is short
-NO_PATTERN = np.zeros((0, 0))  # the fixed-order form needs no pattern of the nonzero entries of constraint rows
-# a row of C_q a = gamma contradicts the other rows if its residual exceeds this fraction of the sum of its |terms|
+TRIAL_STEPS = 10  # a method on trial (fast only with long steps) is replaced if one of its first 10 steps is short
+NO_PATTERN = np.zeros((0, 0))  # in place of the nonzero pattern of constraint rows, which the fixed-order form has
+# constraints contradict one another if accelerations violate a row of C_q a = gamma by more than this * sum of |terms|
 CONTRADICTION = 1e-6
 
 
 class Run:
-    """Data of an integration: plan, kit, workspace, state and controls; a new object is at the start of the run.
+    """Data of an integration: plan (method), kit, workspace, state and controls; at first at the start of the run.
 
     Raise ValueError if accelerations at the start cannot be computed, or if constraints contradict one another.
     """
@@ -96,7 +96,7 @@ class Run:
         self.control[loop_state.FIXED_STEP] = 0.0 if step_size is None else step_size
         self.control[loop_state.MAX_STEPS] = np.inf
         self.control[loop_state.MAY_CROSS], self.control[loop_state.SAMPLE_MOTION] = self.fixed_order is None, 1.0
-        rate_kinds = system.given.keys() & {"constraint_rate", "nonholonomic_rate"}  # if empty: C_t = 0, b = 0
+        rate_kinds = system.given.keys() & {"constraint_rate", "nonholonomic_rate"}  # empty: C_t = b = 0
         self.control[loop_state.MAY_JUMP] = bool(rate_kinds)
         first_chunk = FIRST_CHUNK_IN_PYTHON if system.called_in_python else FIRST_CHUNK
         self.chunk = max(1, first_chunk // max(1, system.n_q // SMALL_SYSTEM))  # largest number of attempts in a chunk
@@ -104,7 +104,7 @@ class Run:
         self._reset_clock(t0)
         self.write_step_control(plan)
         self.substituted = False  # whether `plan.substitute` has replaced the first plan
-        self.near_threshold = singular_threshold(rtol)  # below it, smallest / largest pivot shows a singular position
+        self.near_threshold = singular_threshold(rtol)  # smallest / largest pivot below it: near a singular position
         force_traced = any("force" in each.kinds for each in plan.traced)
         short_and_steep = system.remembered(
             ("changes", force_traced),
@@ -116,18 +116,18 @@ class Run:
         self.forces_may_be_steep = steep or plan.max_gap == 1.0
         self.crossings: list[list[tuple[float, Array]]] = []  # states before and after steps across singular positions
         # the next six attributes belong to steps across a singular position, see fallbacks.py
-        self.mirrored_size = 0.0  # size (s) of a step that begins and ends equally far from the singular position
+        self.mirrored_size = 0.0  # step size (s) across a singular position to the same distance from it, see fallbacks
         self.crossing_tolerances = self.tolerances  # tolerances of steps across singular positions
         self.sizes_to_try: list[float] = []  # step sizes (s) still to be tried across a singular position
         self.crossing_size = 0.0  # size (s) of the last attempted step across a singular position
-        self.piece_ends: list[float] = []  # times (s) at which the next steps along a crossing's polynomial end
+        self.piece_ends: list[float] = []  # ends (s) of next steps on a polynomial across a singular position
         self.origins: list[Any] = []  # `Origin` of each polynomial still to be tried across a singular position
         self.t1 = np.inf  # end of the run (s)
         self.starts_singular = False  # whether the start is a singular position: C_q has a higher rank beside it
         self.branch_known = False  # whether it is known on which branch the motion leaves a singular start
         self.jumps: list[float] = []  # times (s) at which velocities jumped because C_t, or b in A v + b = 0, jumped
-        self.compared_until = [-np.inf]  # callbacks and traces were compared up to this time; copies share the list
-        self.region: CheckedRegion | None = None  # where callbacks and traces were compared; integrators share it
+        self.compared_until = [-np.inf]  # callbacks and traces were compared up to this time; copies share this list
+        self.region: CheckedRegion | None = None  # where callbacks and traces were compared; None: see the system
         self.varied_parameters: Array | None = None  # parameters, if systems that differ in them share this run
         self._compute_start_accelerations()
         self.rank = len(self.work.rows_v)
@@ -156,7 +156,7 @@ class Run:
         return new_run
 
     def restart(self, t: float, q: Array, v: Array) -> int:
-        """Set the run to the state q, v at t, forget past steps, compute accelerations; return DONE or another code."""
+        """Begin anew at the state (q, v) at t, without the past steps; return DONE, or why accelerations failed."""
         n, state = self.system.n_q, self.state
         state[:n], state[n : 2 * n], state[2 * n :] = q, v, 0.0
         self.plan.memory[:] = self.memory
@@ -165,7 +165,7 @@ class Run:
         return code
 
     def move_to_singular_start(self, t: float, q: Array, v: Array, a: Array, first_size: float) -> None:
-        """Move a run's start from beside a singular position into it; `first_size`: size (s) of the first step."""
+        """Move the start of a run into the singular position beside it; `first_size`: size (s) of the first step."""
         n, clock = self.system.n_q, self.clock
         self.t0, self.starts_singular, self.branch_known = t, True, True
         self.state[:n], self.state[n : 2 * n], self.state[2 * n : 3 * n], self.state[3 * n :] = q, v, a, np.nan
@@ -177,7 +177,7 @@ class Run:
         )
 
     def _reset_clock(self, t: float) -> None:
-        """Reset the array `clock` for a run that begins at t."""
+        """Reset `clock`, the array of times, step sizes and similar numbers, for a run that begins at t."""
         a, clock = self.a, self.clock
         clock[:] = 0.0
         clock[a.T] = clock[a.T_START] = t
@@ -191,8 +191,8 @@ class Run:
     ) -> int:
         """Take compiled steps to the last of `outputs`, or until Python must act; return the end code (loop_state.py).
 
-        Steps end at all times in `outputs`. The numbers of states and steps in `buffers` are written to `filled`.
-        `active`: plan, controls and kit for this call, if they differ from the attributes of the run.
+        Steps end at all times in `outputs`. States and steps are stored in `buffers`, and their numbers in `filled`.
+        `active`: plan, `control` and kit for this call; None: those of the run.
         """
         plan, control, kit = active or (self.plan, self.control, self.kit)
         tolerances = self.tolerances if plan is self.plan else self.crossing_tolerances
@@ -215,7 +215,7 @@ class Run:
             jumps=[],
         )
         new_run.crossing_tolerances = new_run.tolerances
-        # a run in the augmented form needs its own kit, because it may change the flags of its kit
+        # kernels may change the flags of the kit in the augmented form: the copy needs a kit of its own
         if self.fixed_order is None and self.kit.flags[indices.FORM] == indices.AUGMENTED:
             new_run.kit = kit_for_plan(self.system, self.kit.flags, new_run.plan)
         return new_run
@@ -226,7 +226,7 @@ class Run:
         return self.plan.ends_at_outputs or self.control[self.a.FIXED_STEP] > 0.0
 
     def write_step_control(self, plan: Plan) -> None:
-        """Copy a plan's constants for step-size control to `control`, and its first limit of step sizes to `clock`."""
+        """Copy a plan's constants for step-size control to the arrays `control` and `clock`, which kernels read."""
         a, control = self.a, self.control
         control[: a.N_RULE] = plan.rule
         control[a.LIMIT_START], control[a.LIMIT_FACTOR] = plan.limit_start, plan.limit_factor
@@ -249,7 +249,7 @@ class Run:
         return work
 
     def may_succeed_in_other_form(self, code: int) -> bool:
-        """Return whether steps that ended with `code` failed with sparse factors, but may succeed in another form."""
+        """Return whether steps failed with `code` perhaps because of sparse factors: another form may succeed."""
         failure_codes = (indices.INNER_DIVERGED, indices.SINGULAR, indices.MASS_NOT_DEFINITE)
         return (
             self.fixed_order is not None
@@ -258,7 +258,7 @@ class Run:
         )
 
     def change_form(self) -> None:
-        """Change the form of linear algebra at the current state, and replace the run's kit and workspace.
+        """Continue a run with another form of linear algebra; the kit and workspace are replaced for this.
 
         If the fixed-order form lacks the program for Newton's matrix, add it; else take a dense form (saddle_point.py).
         """
@@ -283,10 +283,10 @@ class Run:
             clock[a.FAILURE_CODE] = indices.DONE
         state = self.state.copy()
         code = entry_point(self.kernels.start)(self.kit, self.work, t, state)
-        if code == indices.RANK_DIFFERS:  # keep the start's rank, though more rows may be independent now
+        if code == indices.RANK_DIFFERS:  # keep the rank at the start of the run, even if it is higher now
             self.work.notes[indices.GENERATION] = 1.0
             code = entry_point(self.kernels.start)(self.kit, self.work, t, state)
-        if old_work.notes[indices.PIVOT] > 0.0 and largest_pivot > 0.0:  # convert largest_pivot to the new form's scale
+        if old_work.notes[indices.PIVOT] > 0.0 and largest_pivot > 0.0:  # pivots have another scale now
             pivot = self.work.notes[indices.PIVOT]
             self.clock[self.a.LARGEST_PIVOT] = pivot * max(1.0, largest_pivot / old_work.notes[indices.PIVOT])
 
@@ -311,7 +311,7 @@ class Run:
             self.system.derived["ranks"] = ranks
             self.work = self._make_workspace(*ranks)
             code = start(self.kit, self.work, self.t0, self.state)
-        if code == indices.GAMMA_INACCURATE:  # the first step will report this, so that the run has a result
+        if code == indices.GAMMA_INACCURATE:  # ignore it here: the first step reports it in a result
             required_accuracy = self.work.notes[indices.GAMMA_REQUIRED]
             self.work.notes[indices.GAMMA_REQUIRED] = np.inf
             code = start(self.kit, self.work, self.t0, self.state)
@@ -372,7 +372,7 @@ class Run:
         n = self.system.n_q
         a, gamma = self.state[2 * n : 3 * n], self.work.Gamma
         residual = np.abs(rows @ a - gamma)
-        if residual.max() <= CONTRADICTION:  # the limit of a row's residual, below, is at least CONTRADICTION
+        if residual.max() <= CONTRADICTION:  # this is below the limits of all rows
             return np.zeros(0, dtype=np.int64)
         return np.flatnonzero(residual > CONTRADICTION * np.maximum(abs(rows) @ np.abs(a) + np.abs(gamma), 1.0))
 
@@ -384,12 +384,12 @@ class Run:
         if self.fixed_order is None or set(rows) & set(independent_rows):
             return describe_dependence(self.system.rows(self.t0, q), rows)
         factors, zero, x = np.zeros((min(SHOWN, len(rows)), len(all_rows))), np.zeros(len(all_rows)), np.zeros_like(q)
-        for row, factor in zip(rows, factors, strict=False):  # find `factor`: row = factor @ independent rows
+        for row, factor in zip(rows, factors, strict=False):  # find coefficients: row = factor @ independent rows
             entry_point(self.kit.inner)(self.kit, self.work, SOLVE, self.t0, all_rows.row(row), zero, 0.0, x, factor)
         return describe_equations(rows, independent_rows, factors[:, independent_rows], norms(all_rows))
 
     def set_step_sizes(self, first_step: float | None, max_step: float, t1: float) -> None:
-        """Set the first step size and the limits of step sizes (s); if `first_step` is None, estimate it."""
+        """Set the first step size and the limits of step sizes (s); `first_step` None: estimate the first size."""
         self.max_step = max_step
         self.limit_steps()
         proposed_size = self.choose_first_step(self.t0, t1, self.state, max_step)
@@ -398,10 +398,9 @@ class Run:
         self.control[self.a.SHORTEST] = cached_run().SHORTEST_STEP * first_size
 
     def limit_steps(self) -> None:
-        """Set the largest step size so that the time between evaluations is at most a hundredth of the run.
+        """Limit step sizes, so that forces are evaluated at least every hundredth of the run: short ones are seen.
 
-        If forces may be steep, the whole step is at most a hundredth of the run, because a single stage may not reveal
-        a steep force.
+        If forces may be steep, even the step size is at most this time, as one evaluation may not reveal them.
         """
         gap = 1.0 if self.forces_may_be_steep else self.plan.max_gap
         max_size = np.inf if self.plan.evaluates_within else self.tolerances[indices.GAP] / gap
@@ -420,7 +419,7 @@ class Run:
         return float(notes[indices.LARGEST_DEFECT]) if is_checked else None
 
     def passed_near_singular(self) -> bool:
-        """Return whether the run passed near a singular position at an output time, or where a step of fixed size ends.
+        """Return whether a singular position was near at an output time, or at the end of a step of fixed size.
 
         Rounding may have changed velocities there.
         """

@@ -33,9 +33,9 @@ from twoloop.run.singular_start import branch_at
 
 Array = NDArray[np.float64]
 
-MAX_ATTEMPTS = 1024  # number of attempted integration steps after which `IntegrationLoop` takes over from `advance`
+MAX_ATTEMPTS = 1024  # after this many attempted integration steps in one sample, `IntegrationLoop` takes over
 FORCE_KINDS = {"force", "force_by_q", "force_by_v"}  # parameters that change may enter these callbacks only
-CHANGED_PARAMETERS = "the parameters changed at samples"  # text in the field `changes` of all results of SampledRun
+CHANGED_PARAMETERS = "the parameters changed at samples"  # value of the field `changes` of results of SampledRun
 
 
 class SampledState(NamedTuple):
@@ -108,7 +108,7 @@ class SampledRun:
             np.empty((MAX_ATTEMPTS, self.run.a.N_STEP_COLUMNS)),
         )
         self.rows, self.times, self.steps = list[Array](), list[float](), list[Array]()
-        self.cpu_time, self._max_gap = 0.0, np.inf  # CPU time (s); upper limit (s) of the spacing of force samples
+        self.cpu_time, self._max_gap = 0.0, np.inf  # CPU time (s); largest time (s) between force evaluations
         self._store_sample(t0)
 
     def _create_run(self, t: float, q: Array, v: Array) -> Run:
@@ -168,12 +168,12 @@ class SampledRun:
         return self.state
 
     def _step_to(self, end: float) -> None:
-        """Integrate to time `end`; repeat with more force samples if short changes of forces may have been missed."""
+        """Integrate to the time `end`; repeat with more evaluations of forces if short changes may have been missed."""
         for _ in range(MAX_REPETITIONS):
             self._integrate_to(end)
             if not may_have_missed_changes(self.run):
                 return
-            if len(self.times) > 1:  # warn: earlier calls of `step` may have missed changes, and are not repeated
+            if len(self.times) > 1:  # earlier calls of `step` may have missed some, too: warn
                 warn_of_missed_changes(self.run)
             self._max_gap = gap_for_repetition(self.run)
             self._return_to_sample()
@@ -184,7 +184,7 @@ class SampledRun:
         """Integrate once from the last stored state to the time `end`."""
         run, a, clock = self.run, self.run.a, self.run.clock
         t = self.times[-1]
-        # restart also if callbacks called in Python may read variables that have changed since the last call of `step`
+        # Python callbacks may read variables that have changed since the last call of `step`: evaluate them anew
         if self._parameters_changed or self.system.called_in_python:
             self._restart(t)
         run.choose_first_step(self.t0, end, run.state, run.max_step)
@@ -231,7 +231,7 @@ class SampledRun:
         run, a = self.run, self.run.a
         code = entry_point(run.kernels.start)(run.kit, run.work, t, run.state)
         n_not_reset = 0
-        if run.plan.first is not None:  # a pair of methods: keep the entries of `memory` that choose between the two
+        if run.plan.first is not None:  # a pair of methods: keep what chooses between the two
             from twoloop.kernels.control.stiffness import N_SCALARS
 
             n_not_reset = N_SCALARS + 2 * run.system.n_q
@@ -245,7 +245,7 @@ class SampledRun:
         self._parameters_changed = False
 
     def _return_to_sample(self) -> None:
-        """Replace the run, which failed or has to be repeated, by a new run from the last stored state."""
+        """Discard the last integration, which failed or has to be repeated: make a new run at the last stored state."""
         old_run, n = self.run, self.system.n_q
         try:
             self.run = self._create_run(self.t, self.rows[-1][:n], self.rows[-1][n : 2 * n])
@@ -279,7 +279,7 @@ class SampledRun:
         self._parameters_changed = True
 
     def _check_enters_forces_only(self, index: int, value: float) -> None:
-        """Raise ValueError if `value` for a parameter changes other callbacks than forces: the state would jump."""
+        """Raise ValueError if a parameter (new: `value`) affects other callbacks than forces: the state would jump."""
         old_value, n = float(self.p[index]), self.system.n_q
         t, row = self.times[-1], self.rows[-1]
         state = {"q": row[:n], "v": row[n : 2 * n]}

@@ -14,7 +14,7 @@ from twoloop.problem.system import ConstrainedSystem
 
 # code objects of the two functions of twoloop that call the user's callbacks and event functions
 CALLERS_OF_USER_CODE = (PythonFunctions.call.__code__, Event.__call__.__code__)
-COMPILERS = ("numba", "llvmlite")  # packages that break if an exception is raised between two of their instructions
+COMPILERS = ("numba", "llvmlite")  # packages in which a handler must not raise: their data would be left incomplete
 # signals whose handlers are replaced; not all of them exist on Windows
 SIGNAL_NAMES = ("SIGALRM", "SIGINT", "SIGTERM", "SIGUSR1", "SIGUSR2", "SIGVTALRM", "SIGPROF", "SIGHUP")
 SIGNAL_NUMBERS = [int(getattr(signal, name)) for name in SIGNAL_NAMES if hasattr(signal, name)]
@@ -42,7 +42,7 @@ class SignalHandlers:
                         break  # Python calls signal handlers in the main thread only
                     self._user_handlers[number] = handler
                     _signal.signal(number, self._receive)
-        except BaseException:  # raised by a handler that has been called meanwhile
+        except BaseException:  # a signal has arrived meanwhile, and its handler has raised this
             self.restore()
             raise
 
@@ -62,7 +62,7 @@ class SignalHandlers:
     def call_delayed(self) -> None:
         """Call the handlers whose calls were delayed; if a handler has raised an exception, raise it again."""
         while self._delayed_calls and self._handler_error is None:
-            # the frame of the signal is in the compiler: with it, another SignalHandlers would delay the call again
+            # pass the present frame: with that of the signal, in a compiler, other SignalHandlers would delay the call
             self._call_handler(self._delayed_calls.pop(0), sys._getframe())
         if self._handler_error is not None:  # not reset here: `restore` raises it again if the caller catches it
             raise self._handler_error from None
@@ -84,7 +84,7 @@ class SignalHandlers:
 
 
 def signals_of(system: ConstrainedSystem) -> SignalHandlers:
-    """Return the context for work with the callbacks of a system, whose exceptions this work may catch."""
+    """Return a context in which handlers may raise, although code catches the exceptions of a system's callbacks."""
     return SignalHandlers(ctrl_c=system.called_in_python)
 
 
@@ -107,7 +107,7 @@ def is_in_compiler(frame: FrameType | None) -> bool:
 
 
 def raised_by_handler(error: BaseException) -> bool:
-    """Return True if the traceback of an error contains a signal handler, which therefore raised the error."""
+    """Return True if a signal handler raised an error: the traceback contains a handler."""
     # find the Python code of each handler: a function, a method, a partial function, or an object with `__call__`
     callables = [_signal.getsignal(number) for number in SIGNAL_NUMBERS]
     functions = [getattr(each, "__func__", getattr(each, "func", each)) for each in callables if callable(each)]

@@ -2,8 +2,8 @@
 
 "Rows" are the rows of the constraint Jacobian: C_q, then A of the non-holonomic constraints A v + b = 0. Let s be the
 smallest singular value of this matrix, and d the right singular vector of s. If constraints have rounding errors eps,
-they determine q along d only to eps / s. This uncertainty of q changes the rows, so that velocities along d have errors
-of about eps / s^2.
+they determine q along d only to eps / s. As an error of q changes the rows, velocities along d have errors of about
+eps / s^2.
 """
 
 from collections.abc import Callable, Iterator
@@ -22,17 +22,17 @@ TimedState = tuple[float, Array]  # time and state [q, v, ...]
 Crossings = list[list[TimedState]]
 Ratio = Callable[[ConstrainedSystem, float, Array, int], float]
 
-# messages say that constraints lose rank if smallest / largest singular value of their Jacobian is below this
+# messages say that constraints lose rank if (smallest / largest singular value) of their Jacobian is below this
 LOST_RANK_RATIO = 1e-2
-N_POSITIONS = 33  # number of positions between two states at which singular values of the Jacobian are computed
+N_POSITIONS = 33  # the least singular value between two states is searched for at this number of positions
 MAX_SHOWN = 3  # largest number of singular positions in a message
 # displacement of q in finite differences of constraint equations and their Jacobian, relative to the largest coordinate
 DISPLACEMENT = 1e-6
-# rows of the Jacobian are divided by their norms; a row that is small at this position only is divided by MIN_ROW_NORM
-# times its norm at positions nearby, which its derivative yields
+# rows of the Jacobian are scaled to the norm 1. Exception: a row that is small at this position only. Its divisor is
+# MIN_ROW_NORM times the norm that its derivative yields for positions nearby
 MIN_ROW_NORM = 0.1
-# velocities count as discontinuous if they change in a step by more than JUMP_RATIO times the step size times the
-# acceleration, and by more than MIN_JUMP times the tolerances
+# velocities have jumped in a step if they change by more than JUMP_RATIO times (step size * acceleration), and by more
+# than MIN_JUMP times the tolerances
 JUMP_RATIO, MIN_JUMP = 3.0, 10.0
 
 
@@ -63,7 +63,7 @@ def describe_crossings(system: ConstrainedSystem, crossings: Crossings, end_stat
 
 
 def singular_ratio(system: ConstrainedSystem, t: float, q: Array, rank: int) -> float:
-    """Return `rank`-th largest / largest singular value of the constraint Jacobian; 1 if there are no constraints."""
+    """Return (`rank`-th largest / largest singular value) of the constraint Jacobian; 1 if there are no constraints."""
     return _singular_value_ratio(system.rows(t, q), rank)
 
 
@@ -73,7 +73,7 @@ def unit_free_ratio(system: ConstrainedSystem, t: float, q: Array, rank: int) ->
 
 
 def _singular_value_ratio(rows: Array, rank: int) -> float:
-    """Return the `rank`-th largest singular value of a matrix, relative to the largest one; 1 if it has no rows."""
+    """Return (`rank`-th largest / largest singular value) of a matrix; 1 if the matrix has no rows."""
     values = np.linalg.svd(rows, compute_uv=False)[:rank]
     return float(values[-1] / values[0]) if len(values) and values[0] > 0.0 else float(len(values) == 0)
 
@@ -81,7 +81,7 @@ def _singular_value_ratio(rows: Array, rank: int) -> float:
 def _least_ratio_between(
     system: ConstrainedSystem, before: TimedState, after: TimedState, rank: int, ratio: Ratio = singular_ratio
 ) -> float:
-    """Return the least value of the function `ratio` at N_POSITIONS positions, interpolated between two states."""
+    """Return the least `ratio` on the way from one state to another, at N_POSITIONS interpolated positions."""
     n, (t0, first), (t1, last) = system.n_q, before, after
     if t1 == t0:
         return ratio(system, t0, first[:n], rank)
@@ -110,7 +110,7 @@ def describe_velocity_jump(
         threshold = (
             min(LOST_RANK_RATIO, np.sqrt(rtol + float(atol.max()) / largest_q)) if largest_q > 0.0 else LOST_RANK_RATIO
         )
-        # ordinary steps (`across` False) may have switched branches, so do not interpolate: use the last state only
+        # ordinary steps may have switched branches between the two states: do not interpolate, use the last state only
         here, there = (t0, first), (t1, last)
         ratio = _least_ratio_between(system, here if across else there, there, rank, unit_free_ratio)
         if ratio >= threshold:
@@ -141,7 +141,7 @@ def has_velocity_jump_at_end(times: Array, rows: Array, n: int) -> bool:
 
 
 def _crossing_ends(crossings: Crossings, end_state: TimedState) -> Iterator[tuple[TimedState, TimedState, bool]]:
-    """Yield the states before and after a singular position, and whether crossing steps (not ordinary ones) crossed."""
+    """Yield for each position the states before and after it; and True if special steps, not ordinary ones, crossed."""
     before: TimedState | None = None
     for first, *after in crossings:
         before = first if before is None else before
@@ -153,7 +153,7 @@ def _crossing_ends(crossings: Crossings, end_state: TimedState) -> Iterator[tupl
 
 
 def _largest_acceleration(system: ConstrainedSystem, t: float, q: Array, v: Array, min_ratio: float) -> float:
-    """Return max|a_j|; omit singular values of the constraint Jacobian below `min_ratio` times the largest one."""
+    """Return max|a_j|; singular values of the Jacobian below `min_ratio` times the largest one count as zero."""
     mass, rows, norms, units = scaled_to_unit_masses(system, t, q)
     left, values, right = np.linalg.svd(rows, full_matrices=False)
     is_kept = values > min_ratio * values[0]
@@ -198,13 +198,13 @@ def _describe_ratio(ratios: dict[float, float]) -> str:
 ROUNDING = 0.5 * float(np.finfo(np.float64).eps)
 # rounding errors of velocities are estimated only if smallest / largest singular value of the Jacobian is at most this
 WEAK_RATIO = 1e-2
-# rounding errors of velocities are estimated, whatever the tolerances, if the ratio of smallest to largest pivot
-# of the Jacobian is below SMALL_PIVOT. This ratio is typically PIVOT_FACTOR times the ratio of singular values
+# rounding errors of velocities are always estimated if (smallest / largest pivot) of the Jacobian is below SMALL_PIVOT.
+# This ratio of pivots is typically PIVOT_FACTOR times (smallest / largest singular value)
 SMALL_PIVOT, PIVOT_FACTOR = 1e-5, 30.0
 
 
 def singular_threshold(rtol: float) -> float:
-    """Return the ratio of smallest to largest pivot below which rounding may change v by REPORTED_ERROR times rtol."""
+    """Return a limit of (smallest / largest pivot): below it, rounding may change v by REPORTED_ERROR times rtol."""
     return min(
         WEAK_RATIO, max(SMALL_PIVOT, PIVOT_FACTOR * float(np.sqrt(ROUNDING / (REPORTED_ERROR * max(rtol, ROUNDING)))))
     )
@@ -227,7 +227,7 @@ def velocity_rounding_errors(system: ConstrainedSystem, t: float, q: Array, v: A
             row_slopes = np.abs(np.subtract(*(system.rows(t, each) for each in displaced)))
         except (ArithmeticError, ValueError):  # a square root, for example, fails beyond a dead centre
             return np.full(len(q), np.nan)
-        # rounding errors of constraints: proportional to the Jacobian near q, as entries at q may be small by chance
+        # rounding errors of constraints: those of q, times entries of the Jacobian near q (at q, some may be small)
         nearby_rows = np.abs(rows) + (row_slopes * (np.abs(rows).max() / row_slopes.max()) if row_slopes.any() else 0.0)
         rounding = ROUNDING * np.sqrt((nearby_rows * nearby_rows) @ (q * q))
         errors = np.maximum(

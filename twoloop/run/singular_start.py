@@ -1,7 +1,7 @@
 """Start in a singular position, where C_q loses rank, if the velocities there belong to one branch of the motion only.
 
 There, C_q a = gamma does not contain all conditions on the accelerations a. Let u be the vectors with u^T C_q = 0.
-Along a motion, C_q v + C_t stays zero; u^T times its second derivative yields the missing equations
+Along a motion, C_q v + C_t stays zero. Its second time derivative, multiplied by u^T, yields the missing equations
 
     3 u^T (dC_q/dt) a = -u^T d^2/dt^2 (C_q v + C_t), with constant velocities v on the right-hand side.
 
@@ -22,15 +22,15 @@ from twoloop.run.singular_positions import DISPLACEMENT, scaled_to_unit_masses
 Array = NDArray[np.float64]
 
 CHANGE_PER_SAMPLE = 3e-3  # relative change of C_q between two successive samples of a finite difference in time
-# weights of five samples, one unit of time apart, in finite differences for the first (row 0) and second derivative
+# weights of five equidistant samples in finite differences; row 0: first derivative, row 1: second derivative
 WEIGHTS = np.array([[1.0, -8.0, 0.0, 8.0, -1.0], [-1.0, 16.0, -30.0, 16.0, -1.0]]) / 12.0
-# assumed relative error of finite differences: a derivative of C_q below this fraction of C_q counts as 0
+# assumed relative error of finite differences: a derivative of C_q below this fraction of C_q is taken for zero
 MAX_DIFFERENCE_ERROR = 1e-8
-# at the start, some singular values of C_q are zero. The rank of C_q rises along the motion if the time derivative of
-# such a singular value, divided by the norm of dC_q/dt, exceeds this
+# some singular values of C_q are zero at the start. The rank of C_q rises along the motion if one of them changes: if
+# its time derivative, divided by the norm of dC_q/dt, exceeds this
 MIN_RANK_DERIVATIVE = 1e-6
-# the time derivative of a singular value that is zero at the start is certainly nonzero if it exceeds MIN_CLARITY times
-# its uncertainty, which is the norm of dC_q/dt for a velocity as large as the tolerances
+# such a time derivative is certainly nonzero if it exceeds MIN_CLARITY times its uncertainty: the norm of dC_q/dt for a
+# velocity as large as the tolerances
 MIN_CLARITY = 10.0
 # BESIDE_CHANGE: relative change of C_q from the singular start to the nearby state from which the run starts;
 # STEP_CHANGE: relative change of C_q in the first step
@@ -56,11 +56,12 @@ class Branch(NamedTuple):
 
 
 def branch_at(system: ConstrainedSystem, t: float, state: Array, rank: int, allowed: Array) -> Branch | bool | None:
-    """Return the branch of the motion through the singular position of `state` = [q, v, a]; `rank`: rank of C_q there.
+    """Find out whether a start is in a singular position; if so, return the Branch of the motion that leaves it.
 
-    Return None if no rise of the rank along the motion is found: q is not singular, or the motion stays in singular
-    positions, C depends on t, or A exists. Return False if the branch is not certain: another one may have velocities
-    closer to v than the tolerances `allowed` (n_q,), or no state on the branch was found.
+    `state`: [q, v, a] at the start; `rank`: rank of C_q there. Return None if the start counts as not singular: the
+    rank does not rise along the motion, or C depends on t, or non-holonomic constraints exist. Return False if the
+    branch is not certain: another one may have velocities closer to v than the tolerances `allowed` (n_q,), or no state
+    on the branch was found.
     """
     if system.n_a > 0 or "constraint_rate" in system.given or not 0 < rank < min(system.n_c, system.n_q):
         return None
@@ -95,7 +96,7 @@ def _branch_at(system: ConstrainedSystem, t: float, state: Array, rank: int, all
         return None
     step = CHANGE_PER_SAMPLE / speed
     added_rows = lost @ derivative_of_rows(direction, step) / speed
-    slopes = np.linalg.svd(added_rows @ free, compute_uv=False)  # derivatives of the singular values that are zero
+    slopes = np.linalg.svd(added_rows @ free, compute_uv=False)  # time derivatives of the zero singular values
     if slopes.max() <= MIN_RANK_DERIVATIVE * norm:
         return None
     distance = step * float(np.abs(direction).max())  # largest change of a coordinate between two samples
@@ -129,5 +130,5 @@ def _branch_at(system: ConstrainedSystem, t: float, state: Array, rank: int, all
 
 
 def _time_of_change(change: float, speed: float, acceleration: float) -> float:
-    """Return the time (s) of a relative change of C_q, given its relative first and second time derivative."""
+    """Return the time (s) in which C_q changes by the fraction `change`, given (its time derivatives) / |C_q|."""
     return 2.0 * change / (speed + float(np.sqrt(speed * speed + 2.0 * acceleration * change)))

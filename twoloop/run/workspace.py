@@ -40,10 +40,10 @@ from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
 
-# to find out which forces depend on a coordinate or velocity x, x is changed by this fraction of max(1, |x|)
+# forces that change if a coordinate or velocity x is displaced depend on x; the displacement is this * max(1, |x|)
 DISPLACEMENT = 1e-3
-# the matrix of Newton's method in implicit steps is factorized as a sparse matrix if at most this fraction of entries
-# is nonzero, and if this takes at most this fraction of the operations that a dense matrix takes
+# Newton's matrix in implicit steps gets sparse factors if at most this fraction of the force derivatives is nonzero,
+# and if they take at most this fraction of the operations of dense factors
 MAX_NEWTON_SHARE = 0.2
 
 
@@ -56,7 +56,7 @@ def newton_form(
     bodies: list[tuple[int, ...]],
     stiff: list[int],
 ) -> tuple[NDArray[np.int32], int] | None:
-    """Return the program that factorizes the matrix of Newton's method (sparse_lu.py), and the number of column groups.
+    """Return the program (list of operations) that factorizes Newton's sparse matrix, and the number of column groups.
 
     Columns of a group have no nonzero entries in the same row, so that one finite difference of forces yields them all.
     `mass`, `jacobian`: indices of nonzero entries of M and C_q. `bodies`: coordinates of each body. `stiff`: result of
@@ -85,9 +85,9 @@ def newton_form(
 def _derivative_entries(
     system: ConstrainedSystem, t: float, q: Array, v: Array, lam: Array, max_entries: float
 ) -> set[tuple[int, int]]:
-    """Return the indices (i, j) of nonzero entries of d(Q - C_q^T lam)/dq, dQ/dv (Q: forces), and their transposes.
+    """Find the nonzero entries of d(Q - C_q^T lam)/dq and dQ/dv (Q: forces); return the set of their (i, j) and (j, i).
 
-    Find them column by column; stop once they are more than `max_entries`.
+    The search stops once it has found more than `max_entries`.
     """
 
     def reaction(q: Array) -> Array:
@@ -111,37 +111,37 @@ def _derivative_entries(
     return entries
 
 
-# an eigenvector of a body's diagonal block of M counts as massless if its eigenvalue is at most this fraction of the
-# block's largest eigenvalue
+# a direction of motion of a body (eigenvector of its block of M) is massless if its eigenvalue is at most this fraction
+# of the largest eigenvalue of the block
 MASSLESS_RATIO = 1e-10
-# if M is singular, g^T g may be added to M for a row g of C_q whose component along massless directions is longer than
-# this fraction of g
+# a singular M becomes invertible if g^T g is added to it for some rows g of C_q. A row may be chosen if its component
+# along massless directions is longer than this fraction of its norm
 MIN_MASSLESS_FRACTION = 1e-3
-MIN_SIZE_NEWTON = 1.6  # Newton's matrix may get sparse factors if n_q > this times LARGE (problem/callbacks.py)
-MAX_SHARE = 0.05  # sparse factors of M and C_q are used if they need at most this times the operations of dense ones
+MIN_SIZE_NEWTON = 1.6  # Newton's matrix gets dense factors if n_q < this times LARGE, the size of a large system
+MAX_SHARE = 0.05  # sparse factors of M and C_q are used if they take at most this fraction of the dense operations
 
 
 class FixedOrderForm(NamedTuple):
-    """Program that factorizes a large sparse system in an order of elimination chosen once; data for workspaces."""
+    """Fixed-order form: program for the sparse factors of a large system, and sizes and patterns of its matrices."""
 
     program: NDArray[np.int32]
     sizes: FixedOrderSizes  # sizes of the arrays in a workspace for this form
     mass: Entries  # row and column indices of the nonzero entries of M
-    # (n_c, n_q), 1 where C_q may be nonzero, else 0; shape (0, n_q) if callback `jacobian_values` gives nonzero entries
+    # (n_c, n_q), 1 where C_q may be nonzero, else 0; shape (0, n_q): the callback `jacobian_values` is used instead
     pattern: Array
-    # (n_q, n_q), 1 where M may be nonzero, else 0; shape (0, 0) if M is constant or `mass_values` gives its entries
+    # (n_q, n_q), 1 where M may be nonzero, else 0; shape (0, 0): M is constant, or `mass_values` is used instead
     mass_pattern: Array
     newton_arguments: tuple[Any, ...]  # arguments `mass`, `jacobian`, `bodies`, `stiff` of `newton_form`
     newton_program: NDArray[np.int32] | None = None  # factorizes Newton's matrix; None until a plan needs it
     n_groups: int = 0  # number of column groups of Newton's matrix; each takes one finite difference of forces
 
     def matrix_cost(self) -> float:
-        """Return the estimated cost of Newton's matrix with its factors; unit: one evaluation of accelerations."""
+        """Return the estimated cost of computing and factorizing Newton's matrix, in evaluations of accelerations."""
         assert self.newton_program is not None
         return self.n_groups + float(self.newton_program[N_UPDATES]) / max(1.0, float(self.program[N_UPDATES]))
 
     def newton_matrices_size(self, matrices: int) -> int:
-        """Return the number of floats of the sparse matrices that replace `matrices` dense matrices of a plan."""
+        """Return the length of the array for sparse matrices; a plan needs `matrices` dense ones (n_q, n_q) instead."""
         from twoloop.kernels.steps.newton_systems import matrices_size
         from twoloop.kernels.steps.stages import SYSTEMS
 
@@ -167,7 +167,7 @@ def fixed_order_form(system: ConstrainedSystem, t0: float, q0: Array, *plans: Pl
 
 
 def add_newton_program(system: ConstrainedSystem, t0: float, q0: Array, form: FixedOrderForm) -> FixedOrderForm | None:
-    """Return a copy of `form` with the program for Newton's matrix; None if dense factors of this matrix are faster."""
+    """Return `form` with the program for Newton's sparse matrix; None if dense factors of this matrix are faster."""
     if system.n_q < MIN_SIZE_NEWTON * LARGE:
         return None
     cached = system.remembered("newton form", lambda: newton_form(system, t0, q0, *form.newton_arguments))
@@ -204,10 +204,10 @@ def _create_fixed_order_form(system: ConstrainedSystem, t0: float, q0: Array) ->
 
 
 def _coordinates_of_bodies(system: ConstrainedSystem, mass: Entries) -> list[tuple[int, ...]]:
-    """Return the coordinates of each body, as far as `system.joints` names them.
+    """Return a tuple of coordinates for each body that is known.
 
-    A joint names one of its two bodies, so that bodies at the ends of chains may be missing. None is missing if all
-    bodies have seven coordinates in a row (position and Euler parameters).
+    The joints of the system name one body each, so that bodies at the ends of chains may be missing. If all bodies have
+    seven coordinates in a row (position and Euler parameters), none is missing.
     """
     coordinates_by_joint = [joint.translation + joint.rotation for joint in system.joints]
     layouts = {tuple(j - body[0] for j in body) for body in coordinates_by_joint}
@@ -221,10 +221,10 @@ def _coordinates_of_bodies(system: ConstrainedSystem, mass: Entries) -> list[tup
 def _stiff_rows(
     system: ConstrainedSystem, t0: float, q0: Array, mass: Entries, jacobian: Entries, bodies: list[tuple[int, ...]]
 ) -> list[int]:
-    """Return the indices of rows g of C_q for which g^T g is added to a singular M to make it invertible.
+    """Choose the rows g of C_q for which g^T g is added to a singular M to make it invertible; return their indices.
 
-    See sparse_ldl.py. Only rows that concern one body, such as the norm of its Euler parameters, may be chosen: where M
-    is zero, g^T g must be zero, too. No more rows than necessary are chosen.
+    See sparse_ldl.py. A row must belong to one body, such as the norm of its Euler parameters, so that g^T g has no
+    entries where M has none. Rows are chosen only until M is invertible.
     """
     values = system.mass_values(t0, q0) if "mass" in system.entries else system.mass(t0, q0)[mass]
     body_of = np.array(bodies_of(system.n_q, mass, bodies))
@@ -259,7 +259,7 @@ def _stiff_rows(
 
 
 def _massless_directions(block: Array) -> Array:
-    """Return, as rows, the massless eigenvectors of a body's diagonal block of M; unit vectors if it is not finite."""
+    """Return as rows the massless directions of a body, given its block of M; all directions if it is not finite."""
     if not np.isfinite(block).all():
         return np.eye(len(block))
     values, directions = np.linalg.eigh(block)
@@ -290,7 +290,7 @@ def _mass_pattern(system: ConstrainedSystem, t0: float, q0: Array) -> Array:
     return pattern
 
 
-GAMMA_ACCURACY = 1e-11  # smallest relative error that finite differences of C_q and C_t can achieve for gamma
+GAMMA_ACCURACY = 1e-11  # gamma by finite differences may always have this relative error: less cannot be achieved
 MAX_KITS = 16  # largest number of kits in a system's cache; the oldest kit is removed first
 
 
@@ -332,7 +332,7 @@ def _flags_for_start(system: ConstrainedSystem, t0: float, q0: Array) -> Array:
 
 
 def _dense_flags(system: ConstrainedSystem, t0: float, q0: Array, definite: bool) -> tuple[Array, bool]:
-    """Return new flags that choose dense or banded linear algebra, and True if sparse factors would be faster."""
+    """Return new flags that choose dense or banded linear algebra, and whether sparse factors would be faster."""
     flags: Array = system.functions.flags.copy()
     if system.constant_mass:
         flags[DIAGONAL_MASS] = is_diagonal(system.mass(t0, q0))
@@ -346,7 +346,7 @@ def _dense_flags(system: ConstrainedSystem, t0: float, q0: Array, definite: bool
 
 
 def sparse_factors_pay(system: ConstrainedSystem, flags: Array) -> bool:
-    """Return True if sparse factors would be faster than dense ones; they need M definite on allowed velocities."""
+    """Return True if sparse factors of the augmented form would be faster than dense ones (by matrix sizes)."""
     return sparse_pays(system.n_q, system.n_c + system.n_a, bool(flags[DIAGONAL_MASS]))
 
 
@@ -356,7 +356,7 @@ def is_diagonal(mass: Array) -> bool:
 
 
 def kit_for_plan(system: ConstrainedSystem, flags: Array, plan: Plan | None) -> Kit:
-    """Return the kit with given flags and the step functions of a plan from the system's cache, or a new kit."""
+    """Return the kit with these flags and the step functions of a plan: from the system's cache, or else a new one."""
     from twoloop.kernels.evaluation.inner_loop import inner_loop
 
     kits: dict[Any, tuple[Kit, Any]] = system.remembered("kits", dict)
@@ -382,7 +382,7 @@ def kit_for_plan(system: ConstrainedSystem, flags: Array, plan: Plan | None) -> 
 
 
 def _steps_of_plan(plan: Plan) -> tuple[Any, Any, Any]:
-    """Return a plan's step, and both steps of its pair of methods (None: no pair, or the second is not loaded yet)."""
+    """Return a plan's step, and both steps of its pair of methods (None: no pair; a placeholder: not loaded yet)."""
     return load_step(plan.step), load_step(plan.first), step_if_loaded(plan.second)
 
 
@@ -435,7 +435,7 @@ def prepare_workspace(
     reuse: float,
     form: FixedOrderForm | None = None,
 ) -> common.Work:
-    """Reset a workspace for a run from q0, as another run may have used it; return the workspace."""
+    """Reset the arrays of a workspace, new or used by an earlier run, for a run from q0; return the workspace."""
     arrays = map(np.ascontiguousarray, (pattern, q0))
     entry_point(cached_run().prepare_workspace)(work, *lasting_arrays(work), *arrays, max(rtol, GAMMA_ACCURACY), reuse)
     if form is not None:  # kernels of the fixed-order form never change these arrays

@@ -519,10 +519,7 @@ def matrices_size(program: np.ndarray, n_mass: int, n_jacobian: int, n_systems: 
 
 @inlined
 def _sparse_derivative_views(f, w):
-    """Return six views of w.matrices: stored entries of M, G, K and D; and for each row of G, two numbers.
-
-    The first is 1 if the row is independent, else 0. The second is the factor `stiffness`, see sparse_ldl.py.
-    """
+    """Return views of w.matrices: entries of M, G, K, D; copy of w.is_independent; `stiffness`, see sparse_ldl.py."""
     n_mass, n_jacobian, n_rows = w.mass_values.size, w.jacobian_values.size, w.is_independent.size
     begin_K = n_mass + n_jacobian
     begin_D = begin_K + mass_entries_of(f.newton_program)[0].size - n_mass

@@ -42,10 +42,7 @@ def options_array(
     outer_test: float = 1.0,
     power: float = 0.0,
 ) -> NDArray[np.float64]:
-    """Return the array `options` of an implicit Runge-Kutta method with the Butcher tableau A, b, c.
-
-    The other arguments are the scalars explained at STAGES.
-    """
+    """Return the array `options` of a method with the Butcher tableau A, b, c; for other arguments see STAGES."""
     A, b, c = np.asarray(A), np.asarray(b), np.asarray(c)
     scalars = np.array([float(len(b)), inner_tol, outer_tol, extrapolation, outer_test, power])
     vectors = (b, b @ A, c, lagrange_values(c, 0.0), lagrange_values(c, 1.0))

@@ -163,10 +163,7 @@ def _fill_arguments(options, sums, groups, g, more, values, out):
 
 @merged
 def _store_sums(options, sums, scale, values, out):
-    """Evaluate affine expressions in `values`, without their constants; store them, times `scale`, in `out`.
-
-    `sums`: index of the arrays of the expressions, ROWS or BALANCE.
-    """
+    """Evaluate the affine expressions ROWS or BALANCE (`sums`), without constants; store them * `scale` in `out`."""
     column, coefficient = _integer_array(options, sums + COLUMN), _float_array(options, sums + COEFFICIENT)
     indices = _integer_array(options, sums + SUM_INDICES)
     for o in range(column.size):
@@ -305,8 +302,7 @@ def array_views(options, memory, n, n_rows):
 def start_series(options, t, unit, state, N, series, begin_early, x, y, r, c):
     """Begin the Taylor series of a motion at t and `state`: store the coefficients that need no accelerations in N.
 
-    These are orders 0 and 1 of t and q, and order 0 of v and of the operations EARLY (from column `begin_early`). x, y:
-    see `start_operations`. Also set the right-hand sides r and c to zero.
+    These are orders 0, 1 of t and q, and order 0 of v and of the operations EARLY. Also set r and c to zero.
     """
     n = r.size
     r[:], c[:] = 0.0, 0.0
