@@ -308,7 +308,7 @@ class CachedIntegrator:
         """Before the next run, restore attributes of `run` (other than arrays) that the last run may have changed."""
         run, self.loop_used = self.run, False
         if run.plan is self.attributes_at_start["plan"] and not run.substituted and run.kit.flags[FORM] == self.form:
-            # keep the present kit: if `IntegrationLoop` has loaded a step of this plan, only this kit calls it
+            # keep the present kit: it may call a step of this plan that `IntegrationLoop` has loaded meanwhile
             self.attributes_at_start["kit"] = run.kit
         vars(run).update(self.attributes_at_start, crossings=[], jumps=[], sizes_to_try=[], substituted=False)
 
@@ -455,7 +455,7 @@ MAX_OPTIONS, MAX_WORKSPACE, MAX_ENTRIES = 16, 150_000, 3
 
 
 class CacheEntry(NamedTuple):
-    """Cached run at its start, with integrators made from it that are not in use, for calls with the same options."""
+    """Cached run at its start, and integrators made from it that wait for the next call with the same options."""
 
     run: Run
     start: tuple[float, bytes, bytes]  # t0, and the bytes of q0 and v0

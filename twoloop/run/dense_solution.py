@@ -504,7 +504,7 @@ class DenseState:
         self.q, self.v = self._columns_by_time(rows[:, :n]), self._columns_by_time(rows[:, n:])
 
     def _columns_by_time(self, rows: Array) -> Array:
-        """Return `rows` (ascending times) as columns in the order of `self.t`; if that is a scalar, return one row."""
+        """Return `rows` at ascending times as columns in the order of `self.t`; if that is a scalar, the only row."""
         columns = np.empty(rows.shape[::-1])
         columns[:, self._order] = rows.T
         return columns if np.ndim(self.t) else columns[:, 0]

@@ -64,9 +64,9 @@ MAX_RESIDUAL = 1e-8  # largest residual of the equations for v after a jump, rel
 
 
 def state_after_jump(system: ConstrainedSystem, t: float, q: Array, v: Array) -> Array | None:
-    """Return the state [q, v] after an impact, as a drive's velocity has jumped; None if no velocities are consistent.
+    """Return [q, v] made consistent at t, v by impulses of the constraints; None if no velocities are consistent.
 
-    At t, the rate C_t, or b in A v + b = 0, is the one after the jump. Solve M (v+ - v) + G^T p = 0 and
+    This is necessary after a jump of the rate C_t, or of b in A v + b = 0. Solve M (v+ - v) + G^T p = 0 and
     G v+ + (C_t, b) = 0 for the velocities after the jump, v+, and the impulses p.
     """
     q = corrected_positions(system, t, q)
@@ -225,7 +225,7 @@ def _is_near_start(run: Run) -> bool:
 
 
 def _prepare_next_origin(run: Run, plan: Plan, control: Array) -> None:
-    """Move the first of `run.origins` to the plan's memory, and set the step sizes and limits to try from there."""
+    """Begin the next polynomial of `run.origins`: store its origin in the plan's memory; set step sizes and limits."""
     from twoloop.kernels.steps.crossing_step import begin_polynomial
 
     a, clock = run.a, run.clock

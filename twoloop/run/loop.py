@@ -477,7 +477,7 @@ class IntegrationLoop:
         return record_of(Record, DEFAULTS | fields)
 
     def _suspicious_last_step(self, t: Array, table: Array) -> list[TimedState]:
-        """Return [(t, state) before the last step] if velocities jumped in that step for no known reason; else []."""
+        """Return [(t, state) before the last step] if v changed in it by more than accelerations explain; else []."""
         run = self.run
         if self.request.times is not None or self.recorder.end_event is not None:
             return []
@@ -486,7 +486,7 @@ class IntegrationLoop:
         return [(float(t[-2]), table[-2])] if has_velocity_jump_at_end(t, table, run.system.n_q) else []
 
     def _suspicious_outputs(self, t: Array, table: Array) -> list[TimedState]:
-        """Return all output states if the run passed near a singular position at one of them, else []; for a check."""
+        """Return the output states, for a check, if a singular position was near when a step ended at one; else []."""
         run, request = self.run, self.request
         equal_steps = run.control[run.a.FIXED_STEP] > 0.0 and request.times is None
         if not run.passed_near_singular() or not (

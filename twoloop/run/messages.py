@@ -62,7 +62,7 @@ class StallDetector:
         self.window_n += len(h)
 
     def is_stalled(self, t: float, t1: float) -> bool:
-        """Return whether the rest, from t to t1, takes too many steps; False if the last check was just before."""
+        """Return whether the rest of the run takes too many steps; only every STAGNATION_STEPS steps, else False."""
         if self.window_n < STAGNATION_STEPS:
             return False
         self.mean_step = (t - self.window_t) / self.window_n
@@ -81,8 +81,7 @@ N_ITERATIONS = 6  # number of power iterations at each sampled state
 # a power iteration starts with the eigenvector at the previous sample, to which INITIAL_FACTOR times a vector without
 # zeros (`initial_direction`) is added: a component that is zero at the start might stay zero
 INITIAL_FACTOR = 0.1
-# in a power iteration x -> J x, the dominant eigenvalue of J is negative if cos(angle between x and J x) is below minus
-# this number
+# in a power iteration x -> J x, the dominant eigenvalue of J is negative if cos(x, J x) is below minus this number
 MIN_ALIGNMENT = 0.9
 MIN_STEPS = 200  # after fewer accepted steps, a message does not mention stiffness
 # stability limited the steps if the median, over all samples, of h * rate / limit is at least this; 0.4 is typical of
@@ -245,9 +244,9 @@ def reject_velocity_jumps(
 ) -> tuple[Status, str]:
     """Withdraw the success of a run if rounding, or a change of branch, changed velocities near a singular position.
 
-    Then return RANK_LOST and a message with the reason, else return `status` and `message`. Checked are the states
-    beside crossed positions, `last_step` ([state before the last step] if velocities jumped in it, else []), and
-    `output_states`, as far as they are before the time `end`.
+    Then return RANK_LOST and a message with the reason, else return `status` and `message`. These states are checked,
+    as far as they are before the time `end`: those before and after crossed positions; `last_step`: [state before the
+    last step] if velocities jumped in it, else []; `output_states`.
     """
     end_state, crossings = (float(run.clock[run.a.T]), run.state), [each for each in run.crossings if each[0][0] < end]
     reason = describe_rounding(run, [*(state for ends in crossings for state in ends), *output_states], end)
@@ -370,7 +369,7 @@ def _describe_stall(run: "Run", t1: float, stall: StallDetector) -> str:
 
 
 def _describe_contradiction(run: "Run") -> str:
-    """Return the message of a run that stopped as a redundant row was violated, or its start has no certain branch."""
+    """Return the message of a run that stopped: a redundant row is violated, or no certain branch leaves its start."""
     t, q = float(run.clock[run.a.T]), run.state[: run.system.n_q]
     if run.starts_singular:
         return (

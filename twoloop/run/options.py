@@ -62,7 +62,7 @@ class Options:
             run.set_step_sizes(self.first_step, self.max_step, t1)
 
 
-NO_OPTIONS: Any = (None,) * 12, None  # arguments and options of the last call, before the first call
+NO_OPTIONS: Any = (None,) * 12, None  # stored arguments and options of the last call; all None before the first call
 
 
 def options_of(

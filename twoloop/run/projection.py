@@ -502,7 +502,7 @@ def _weakest_direction(scaled: Array, free: NDArray[np.intp]) -> Array:
 
 
 def _describe_rank_loss(scales: Scales, jacobian: Array, free: NDArray[np.intp], kept: list[int]) -> str:
-    """Return a sentence if C_q nearly loses rank in any units (also with scaled rows and columns), else ""."""
+    """Return a sentence if C_q nearly loses rank, both unscaled and with scaled rows and columns; else ""."""
     if jacobian[:, free].size == 0:
         return ""
     values = [np.linalg.svd(each[:, free], compute_uv=False) for each in (jacobian, scales.scaled(jacobian))]

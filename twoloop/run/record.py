@@ -520,7 +520,7 @@ class _Deferred:
 
 
 DEFAULTS = {each.name: each.default for each in fields(Record) if each.default is not MISSING}
-for _field in fields(Record):  # not in the class: `dataclass` would use it as a default value
+for _field in fields(Record):  # not in the class, where `dataclass` would take descriptors for defaults
     setattr(Record, _field.name, _Deferred(_field.name))
 
 

@@ -46,7 +46,7 @@ FIRST_CHUNK = 1024
 FIRST_CHUNK_IN_PYTHON = 64  # value of FIRST_CHUNK if callbacks are Python functions, which are slow
 SMALL_SYSTEM = 32  # largest number of coordinates of a small system; larger systems have proportionally smaller chunks
 TRIAL_STEPS = 10  # a method on trial (fast only with long steps) is replaced if one of its first 10 steps is short
-NO_PATTERN = np.zeros((0, 0))  # in place of the nonzero pattern of constraint rows, which the fixed-order form has
+NO_PATTERN = np.zeros((0, 0))  # instead of the nonzero pattern of constraint rows, in the fixed-order form
 # constraints contradict one another if accelerations violate a row of C_q a = gamma by more than this * sum of |terms|
 CONTRADICTION = 1e-6
 
@@ -116,7 +116,7 @@ class Run:
         self.forces_may_be_steep = steep or plan.max_gap == 1.0
         self.crossings: list[list[tuple[float, Array]]] = []  # states before and after steps across singular positions
         # the next six attributes belong to steps across a singular position, see fallbacks.py
-        self.mirrored_size = 0.0  # step size (s) across a singular position to the same distance from it, see fallbacks
+        self.mirrored_size = 0.0  # size (s) of a step from before a singular position to as far beyond it
         self.crossing_tolerances = self.tolerances  # tolerances of steps across singular positions
         self.sizes_to_try: list[float] = []  # step sizes (s) still to be tried across a singular position
         self.crossing_size = 0.0  # size (s) of the last attempted step across a singular position
@@ -249,7 +249,7 @@ class Run:
         return work
 
     def may_succeed_in_other_form(self, code: int) -> bool:
-        """Return whether steps failed with `code` perhaps because of sparse factors: another form may succeed."""
+        """Return whether another form of linear algebra may succeed where sparse factors failed with `code`."""
         failure_codes = (indices.INNER_DIVERGED, indices.SINGULAR, indices.MASS_NOT_DEFINITE)
         return (
             self.fixed_order is not None
@@ -372,7 +372,7 @@ class Run:
         n = self.system.n_q
         a, gamma = self.state[2 * n : 3 * n], self.work.Gamma
         residual = np.abs(rows @ a - gamma)
-        if residual.max() <= CONTRADICTION:  # this is below the limits of all rows
+        if residual.max() <= CONTRADICTION:  # then it is within the limit of each row
             return np.zeros(0, dtype=np.int64)
         return np.flatnonzero(residual > CONTRADICTION * np.maximum(abs(rows) @ np.abs(a) + np.abs(gamma), 1.0))
 

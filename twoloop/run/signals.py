@@ -32,7 +32,7 @@ class SignalHandlers:
 
     def __init__(self, ctrl_c: bool = False) -> None:
         self._user_handlers: dict[int, Any] = {}
-        self._delayed_calls: list[int] = []  # numbers of signals
+        self._delayed_calls: list[int] = []  # numbers of signals whose handlers are still to be called
         self._handler_error: BaseException | None = None
         try:
             for number in SIGNAL_NUMBERS:
@@ -84,7 +84,7 @@ class SignalHandlers:
 
 
 def signals_of(system: ConstrainedSystem) -> SignalHandlers:
-    """Return a context in which handlers may raise, although code catches the exceptions of a system's callbacks."""
+    """Return a context for code that catches exceptions of callbacks: those of signal handlers are not lost in it."""
     return SignalHandlers(ctrl_c=system.called_in_python)
 
 

@@ -29,8 +29,8 @@ MAX_DIFFERENCE_ERROR = 1e-8
 # some singular values of C_q are zero at the start. The rank of C_q rises along the motion if one of them changes: if
 # its time derivative, divided by the norm of dC_q/dt, exceeds this
 MIN_RANK_DERIVATIVE = 1e-6
-# such a time derivative is certainly nonzero if it exceeds MIN_CLARITY times its uncertainty: the norm of dC_q/dt for a
-# velocity as large as the tolerances
+# the time derivative of a singular value that is zero at the start is certainly not zero if it exceeds this number
+# times its uncertainty, which is the norm of dC_q/dt for a velocity as large as the tolerances
 MIN_CLARITY = 10.0
 # BESIDE_CHANGE: relative change of C_q from the singular start to the nearby state from which the run starts;
 # STEP_CHANGE: relative change of C_q in the first step

@@ -141,7 +141,7 @@ class FixedOrderForm(NamedTuple):
         return self.n_groups + float(self.newton_program[N_UPDATES]) / max(1.0, float(self.program[N_UPDATES]))
 
     def newton_matrices_size(self, matrices: int) -> int:
-        """Return the length of the array for sparse matrices; a plan needs `matrices` dense ones (n_q, n_q) instead."""
+        """Return the length of the array of sparse matrices that replaces a plan's `matrices` dense ones (n_q, n_q)."""
         from twoloop.kernels.steps.newton_systems import matrices_size
         from twoloop.kernels.steps.stages import SYSTEMS
 

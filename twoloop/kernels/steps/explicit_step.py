@@ -139,8 +139,8 @@ def explicit_step(f, w, options, memory, t, h, tolerances, state, new_state):
     )
     begin, width = N_VECTORS * _padded_width(n), _padded_width(n)
     slopes = memory[begin : begin + s * width].reshape((s, width))  # velocities and accelerations of each stage
-    # near a singular position, stages are projected even if FREE is 1: on which side of the position a stage lies, and
-    # how accurate its velocities are, matters there
+    # near a singular position, stages are projected even if FREE is 1: otherwise, they might be on the wrong side of
+    # the position, or their velocities inaccurate
     is_near = options[FREE] == 1.0 and w.nearly_singular != 0.0
     is_free = options[FREE] == 1.0 and not is_near
     ratio_to_gap = gap_ratio(tolerances, h)

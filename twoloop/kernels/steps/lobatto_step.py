@@ -60,7 +60,7 @@ MAX_GUESSES = 4  # largest number of guesses of the first step size
 FACTOR_AFTER_DIVERGENCE = 0.6  # ratio of the next step size to the size of a step whose iteration did not converge
 SAFETY = 0.75  # safety factor on the step size for which the estimated error would equal the tolerance
 MAX_LIMITED = 24.0  # another method takes over if data[LIMITED] (steps limited by convergence) reaches this number
-MIN_CURVATURE = 0.1  # accelerations hardly vary within a step if data[CURVATURE] is below this (in tolerances)
+MIN_CURVATURE = 0.1  # accelerations hardly vary in a step if data[CURVATURE], their Legendre coefficient, is smaller
 N_PIVOT_PARTS = 4  # pivots of C_q are checked at 1/4, 1/2 and 3/4 of a step, the ends of this number of equal parts
 MIN_PIVOT_RATIO = 0.4  # another method takes over if a step reduces the smallest pivot of C_q below this fraction
 # if the smallest tolerance is below this, another method takes over once a singular position was near. Without this

@@ -46,8 +46,8 @@ from twoloop.kernels.steps.velocity_errors import STEPS_TO_DECAY, filtered_veloc
 
 # the next step computes new derivatives if the last Newton correction exceeds this fraction of the previous one
 SLOW_CONTRACTION = 0.05
-# if corrections no longer decrease in a step of fixed size, Newton's method has converged if the last correction,
-# relative to max(1, |value|), is at most this; otherwise, the step fails
+# in steps of fixed size, rounding may prevent that corrections decrease to the tolerance. Newton's method has also
+# converged if the last correction, relative to max(1, |value|), is at most this; otherwise, the step fails
 MAX_ROUNDING_CORRECTION_FIXED = 1e-9
 
 
@@ -83,7 +83,7 @@ def _solve_stages(f, w, options, memory, t, h, tolerances, q, v, A_stage):
                 return code
             for m in range(n):
                 residual[j, m] = a_new[m] - A_stage[j, m]
-            if f.form != FIXED_ORDER:  # in the fixed-order form, no coordinate is dependent
+            if f.form != FIXED_ORDER:  # the fixed-order form treats all coordinates as independent
                 for m in w.dependent:
                     A_stage[j, m] = a_new[m]
         scale_q, scale_v = 1.0, 1.0

@@ -74,8 +74,8 @@ from twoloop.kernels.steps.stages import (
 
 MAX_ITERATIONS = 15  # largest number of Newton iterations: if they do not converge, the step fails
 EQUAL_STEP_TOLERANCE = 1e-9  # step sizes count as equal up to this relative difference, which rounding of times causes
-# if corrections no longer decrease, Newton's method has converged if the last one is at most this fraction of the
-# smallest tolerance; otherwise, the step fails
+# rounding may prevent that corrections decrease to the tolerance of Newton's method. The method has also converged if
+# the last correction is at most this fraction of the smallest tolerance of the run; otherwise, the step fails
 MAX_ROUNDING_CORRECTION = 0.1
 
 RELATIVE_DISPLACEMENT = 1e-7  # displacement of q or v in finite differences, relative to max(1, |value|)
@@ -183,26 +183,29 @@ def fill_tangent_by_v(f, t, q, v, b, D):
 
 
 @compiled
-def reduce_to_independents(w, A, AT, B):
-    """Project a matrix A (n_q, n_q) onto the velocities v = T v_i that C_q allows: store A T in AT, T^T A T in B."""
-    n, m = AT.shape
+def reduce_to_independents(w, matrix, matrix_T, reduced):
+    """Project a matrix (n_q, n_q), such as M, onto the velocities v = T v_i that C_q allows.
+
+    Store matrix T in matrix_T (n_q, n_dof), and T^T matrix T in `reduced` (n_dof, n_dof).
+    """
+    n, m = matrix_T.shape
     columns = columns_of(w.index)
     for i in range(n):
         for k in range(m):
-            AT[i, k] = A[i, w.independent[k]]
+            matrix_T[i, k] = matrix[i, w.independent[k]]
         for c in range(columns.size):
-            factor = A[i, columns[c]]
+            factor = matrix[i, columns[c]]
             if factor != 0.0:
                 for k in range(m):
-                    AT[i, k] += factor * w.D[k, c]
+                    matrix_T[i, k] += factor * w.D[k, c]
     for l in range(m):
-        copy(AT[w.independent[l]], B[l])
+        copy(matrix_T[w.independent[l]], reduced[l])
         for c in range(columns.size):
             factor = w.D[l, c]
             if factor != 0.0:
-                row = AT[columns[c]]
+                row = matrix_T[columns[c]]
                 for k in range(m):
-                    B[l, k] += factor * row[k]
+                    reduced[l, k] += factor * row[k]
 
 
 @compiled
@@ -320,7 +323,7 @@ def _filter_error_dense(w, options, memory, s, h, e_q, e_v):
 
 @inlined
 def _band_view(numbers, n, b):
-    """Return a view (n, 2 b + 1) of `numbers`, the band of a matrix such as K; its element [i, b + j - i] is K_ij."""
+    """Return a view (n, 2 b + 1) of `numbers`: a matrix K with bandwidth b; its element [i, b + j - i] is K_ij."""
     return numbers[: n * (2 * b + 1)].reshape((n, 2 * b + 1))
 
 
@@ -462,7 +465,7 @@ def _factor_banded(w, memory, s, b, index, z, numbers, factorize, substitute):
 
 @compiled
 def _multiply_by_T(w, b, x, X):
-    """Store T x[:n_dof] in X (n_q): complete independent velocities by the dependent ones that C_q requires."""
+    """Complete independent velocities x[:n_dof] by the dependent ones that C_q requires: store T x in X (n_q)."""
     n_dof = w.independent.size
     _, D, columns = _border_views(w, w.Q.size, w.rows.size, b)
     for i in columns:
@@ -475,7 +478,7 @@ def _multiply_by_T(w, b, x, X):
 
 @compiled
 def _solve_and_keep_independents(w, b, numbers, pivots, substitute, x):
-    """Solve the bordered system with right-hand side x (n_q); store the result for v_i in x[:n_dof]."""
+    """Solve the bordered system with right-hand side x (n_q); move independent entries of the result to x[:n_dof]."""
     Cq, _, _ = _border_views(w, x.size, w.rows.size, b)
     solve_bordered(w, b, Cq, numbers, pivots, substitute, x)
     for k in range(w.independent.size):  # in ascending order, no entry is overwritten before it is read
@@ -510,7 +513,10 @@ N_SPARSE_VECTORS = 3  # number of real scratch vectors, which _sparse_scratch re
 
 
 def matrices_size(program: np.ndarray, n_mass: int, n_jacobian: int, n_systems: int) -> int:
-    """Return the length of w.matrices in sparse storage; n_mass, n_jacobian: numbers of stored entries of M and G."""
+    """Return the length of w.matrices in sparse storage, for n_systems complex systems of Newton's method.
+
+    n_mass, n_jacobian: numbers of stored entries of M and G. `program`: factorizes Newton's matrix.
+    """
     n = int(program[N_PIVOTS])
     n_tangents = int(program[N_OF_MASS]) - n_mass
     n_factors = n + 2 * int(program[N_OFF_DIAGONAL])
@@ -554,7 +560,7 @@ def _sparse_scratch(f, w):
 
 @inlined
 def _sparse_factor_view(f, w, k):
-    """Return a real view of sparse factors: of the matrix of `filter_error` if k = 0, else of eigenvalue k - 1."""
+    """Return a real view of factors: of the matrix of `filter_error` (k = 0), or Newton's for eigenvalue k - 1."""
     n = f.newton_program[N_PIVOTS]
     n_factors = n + 2 * f.newton_program[N_OFF_DIAGONAL]
     begin = w.mass_values.size + w.jacobian_values.size + (N_SPARSE_VECTORS + 7) * n

@@ -40,7 +40,7 @@ from twoloop.kernels.linalg.dense import copy
 from twoloop.kernels.linalg.saddle_point import solve_with_multipliers
 
 # indices of the scalars in `options`. After the scalars, `options` contains the series program (list of operations that
-# computes Taylor coefficients): the offsets of its arrays, then the arrays. Integers are stored as bits of floats
+# computes Taylor coefficients): the offsets of its arrays, then the arrays. Integers are stored as the bits of floats
 (
     ORDER,  # order of the Taylor series of the positions q
     THETA,  # a projection has converged if its last correction is at most this, see `project`
