@@ -313,7 +313,7 @@ class CachedIntegrator:
         vars(run).update(self.attributes_at_start, crossings=[], jumps=[], sizes_to_try=[], substituted=False)
 
     def _callbacks_are_correct(self, t: Array, rows: Array, t1: float, is_inside: bool, is_due: bool) -> bool:
-        """Return whether callbacks are correct at `rows` (states at times t); see `check_callbacks_along_run`."""
+        """Return whether callbacks agree with traces at `rows` (states at times t), see `check_callbacks_along_run`."""
         n = 2 * self.run.system.n_q
 
         def states(all_states: bool) -> Array:

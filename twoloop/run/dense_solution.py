@@ -294,7 +294,7 @@ class Interpolator:
         return self._states_in_crossing_step(table, i, plan.memory) if succeeded else None
 
     def _states_in_crossing_step(self, table: StateTable, i: int, memory: Array) -> tuple[Array, Array]:
-        """Return times and states within interval i, by the polynomial that a step across it stored in `memory`."""
+        """Return times and states within interval i, from the polynomial that a step across it stored in `memory`."""
         from twoloop.kernels.steps.crossing_step import state_at
 
         n, options = self.system.n_q, crossing_plan(self.system.n_q).options

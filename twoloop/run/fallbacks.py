@@ -27,7 +27,7 @@ from twoloop.run.workspace import kit_for_plan, make_kit
 REPEAT_BELOW, WARN_BELOW = 2.0, 1.25
 EVALUATIONS_PER_CHANGE = 4.0  # number of evaluations that a repetition makes within the shortest change seen so far
 MAX_REFINEMENT = 8.0  # largest factor by which a repetition reduces the longest time between evaluations
-MAX_REPETITIONS = 2  # largest number of repetitions of a run
+MAX_REPETITIONS = 2  # largest number of repetitions of a run that may have missed short changes of forces
 
 
 def may_have_missed_changes(run: Run, limit: float = REPEAT_BELOW) -> bool:
@@ -114,7 +114,7 @@ NODE_DISTANCES = 1.0, 0.5, 0.25  # values of Limits.node_distance (see there) th
 class Limits(NamedTuple):
     """Limits for the polynomial and step across a singular position; if no step succeeds, wider ones are tried."""
 
-    has_wide_gaps: bool  # whether the limit of the time between evaluations is multiplied by GAP_FACTOR
+    has_wide_gaps: bool  # whether the longest allowed time between evaluations is multiplied by GAP_FACTOR
     may_approach: bool  # whether a step may end before the singular position, nearer to it than it began
     tolerance_factor: float  # factor by which the tolerances of these steps are multiplied
     # nodes nearer to the position than this factor times the usual limit are left out, because their rounding errors

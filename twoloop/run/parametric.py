@@ -66,7 +66,7 @@ class SharedSetup:
             raise ValueError("its numbers differ from the values of the traced expressions")
 
     def region(self, with_derivatives: bool) -> CheckedRegion:
-        """Return the region of states where runs have compared callbacks (and derivatives, if asked) with traces."""
+        """Return the region of states where runs have compared callbacks (derivatives, too, if `with_derivatives`)."""
         return self._regions.setdefault(with_derivatives, CheckedRegion())
 
 

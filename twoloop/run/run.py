@@ -43,7 +43,7 @@ Buffers = tuple[Array, Array, Array]  # times, states and steps
 # largest number of attempted steps in the first chunk (call of compiled code) of a small system. After each chunk,
 # checks in Python take 0.2 ms, a large part of the time of a shorter chunk
 FIRST_CHUNK = 1024
-FIRST_CHUNK_IN_PYTHON = 64  # value of FIRST_CHUNK if callbacks are Python functions, which are slow
+FIRST_CHUNK_IN_PYTHON = 64  # largest number of steps in the first chunk if callbacks are (slow) Python functions
 SMALL_SYSTEM = 32  # largest number of coordinates of a small system; larger systems have proportionally smaller chunks
 TRIAL_STEPS = 10  # a method on trial (fast only with long steps) is replaced if one of its first 10 steps is short
 NO_PATTERN = np.zeros((0, 0))  # instead of the nonzero pattern of constraint rows, in the fixed-order form
@@ -127,7 +127,7 @@ class Run:
         self.branch_known = False  # whether it is known on which branch the motion leaves a singular start
         self.jumps: list[float] = []  # times (s) at which velocities jumped because C_t, or b in A v + b = 0, jumped
         self.compared_until = [-np.inf]  # callbacks and traces were compared up to this time; copies share this list
-        self.region: CheckedRegion | None = None  # where callbacks and traces were compared; None: see the system
+        self.region: CheckedRegion | None = None  # where callbacks and traces were compared; None: in the system
         self.varied_parameters: Array | None = None  # parameters, if systems that differ in them share this run
         self._compute_start_accelerations()
         self.rank = len(self.work.rows_v)
@@ -423,7 +423,8 @@ class Run:
 
         Rounding may have changed velocities there.
         """
-        threshold = self.near_threshold if self.fixed_order is None else SMALL_PIVOT  # fixed-order pivots vary more
+        # pivots of the fixed-order form vary more, so that a larger one does not show a singular position
+        threshold = self.near_threshold if self.fixed_order is None else SMALL_PIVOT
         return bool(self.clock[self.a.PIVOT_AT_OUTPUT] < threshold)
 
     def n_attempts(self) -> int:

@@ -18,7 +18,7 @@ from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
 TimedState = tuple[float, Array]  # time and state [q, v, ...]
-# for each crossed singular position: the state before it and, if the crossing was completed, the state after it
+# for each singular position that steps crossed: the state before it; if the crossing was completed, the state after it
 Crossings = list[list[TimedState]]
 Ratio = Callable[[ConstrainedSystem, float, Array, int], float]
 

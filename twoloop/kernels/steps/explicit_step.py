@@ -116,7 +116,7 @@ def largest_error(tolerances, y, y1, fine_error, coarse_error, strict):
 
 @compiled
 def _estimate_error(tolerances, h, fine, coarse, y, y1, slopes, fine_error, coarse_error, strict):
-    """Store h times the `fine` and `coarse` weighted sums of `slopes`; return the `largest_error` from these two."""
+    """Compute both error estimates, h * weights @ slopes, of a step from y to y1; return their `largest_error`."""
     sum_rows(fine, slopes, fine_error)
     sum_rows(coarse, slopes, coarse_error)
     for m in range(y.size):

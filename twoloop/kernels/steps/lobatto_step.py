@@ -70,7 +70,7 @@ MAX_FAILURES = 12.0  # another method takes over if data[FAILURES] reaches this:
 CHECKED_GAP = 0.0908  # longest time between evaluations, relative to the step size, if some are also between the nodes
 # largest ratio of successive step sizes: GROWTH_EARLY in the first N_EARLY steps of a run, GROWTH in later steps
 N_EARLY, GROWTH_EARLY, GROWTH = 6, 4.0, 1.3
-GROWTH_ONE_SWEEP = 30.0  # replaces GROWTH_EARLY after a step that took only one sweep
+GROWTH_ONE_SWEEP = 30.0  # largest ratio of step sizes early in a run, after a step that took only one sweep
 MIN_FACTOR = 0.4  # smallest ratio of the next step size to the size of an accepted step
 LEAST_TREND = 0.4  # lower bound of the ratio of the step sizes that the errors of two successive steps allow
 # convergence allows steps this many times as long if each sweep evaluates accelerations twice instead of once
@@ -188,7 +188,7 @@ def _accept_polynomial(data):
 
 @merged
 def _must_change_method(w, data, tolerances):
-    """Return True if another method has to take over: stiffness limits the steps, or a singular position is near."""
+    """Return True if another method must take over, as stiffness limits the steps, or a singular position is near."""
     is_stiff = data[field.LIMITED] >= MAX_LIMITED or data[field.FAILURES] >= MAX_FAILURES
     is_near = w.near_now == 1.0 or tolerances[LEAST] < TIGHT_TOLERANCE
     return is_stiff or (w.nearly_singular == 1.0 and is_near)

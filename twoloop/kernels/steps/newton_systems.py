@@ -525,7 +525,7 @@ def matrices_size(program: np.ndarray, n_mass: int, n_jacobian: int, n_systems: 
 
 @inlined
 def _sparse_derivative_views(f, w):
-    """Return views of w.matrices: entries of M, G, K, D; copy of w.is_independent; `stiffness`, see sparse_ldl.py."""
+    """Return views of w.matrices: entries of M, G, K, D; for each row of G, 1 if independent, and its `stiffness`."""
     n_mass, n_jacobian, n_rows = w.mass_values.size, w.jacobian_values.size, w.is_independent.size
     begin_K = n_mass + n_jacobian
     begin_D = begin_K + mass_entries_of(f.newton_program)[0].size - n_mass

@@ -1,6 +1,6 @@
 """Define the arrays `options` and `memory` of implicit Runge-Kutta steps, and functions that these steps share.
 
-Compiling a step takes a third of the time of the first run, so a step is imported only if a run needs it (`LazyStep`).
+Compiling a step takes a third of the time of the first run. So a run imports only the steps that it needs (`LazyStep`).
 """
 
 from importlib import import_module

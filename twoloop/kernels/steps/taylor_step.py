@@ -163,7 +163,7 @@ def _fill_arguments(options, sums, groups, g, more, values, out):
 
 @merged
 def _store_sums(options, sums, scale, values, out):
-    """Evaluate the affine expressions ROWS or BALANCE (`sums`), without constants; store them * `scale` in `out`."""
+    """Evaluate expressions (`sums`: ROWS or BALANCE) without constants; store `scale` times their values in `out`."""
     column, coefficient = _integer_array(options, sums + COLUMN), _float_array(options, sums + COEFFICIENT)
     indices = _integer_array(options, sums + SUM_INDICES)
     for o in range(column.size):
