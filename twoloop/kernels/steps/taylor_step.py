@@ -44,7 +44,7 @@ from twoloop.kernels.linalg.saddle_point import solve_with_multipliers
 (
     ORDER,  # order of the Taylor series of the positions q
     THETA,  # a projection has converged if its last correction is at most this, see `project`
-    N_NODES,  # number of quantities of the program: inputs, unknowns and results of operations
+    N_NODES,  # number of quantities of the series program: inputs, unknowns and results of operations
     EARLY_WIDTH,  # number of operations on t and q only (early operations), rounded up to a multiple of eight
     LATE_WIDTH,  # number of operations on velocities, too (late operations), rounded up to a multiple of eight
     KEEP,  # 1: the steps are parts of one step, and all use the series about its beginning; 0: each has its own
@@ -68,13 +68,13 @@ BALANCE, N_ARRAYS = ROWS + N_SUMS + 1, ROWS + 2 * (N_SUMS + 1)
 KIND, BEGIN, END, MORE_FIRST, _, MORE_SECOND, _, N_GROUP = range(8)
 
 # indices of the scalars in `memory`. Two Taylor series of q (ORDER + 1, n_q each) and arrays (`array_views`) follow.
-# The current series is about the beginning of the step; the other one is about the end of the attempted step
+# One series is about the beginning of the step, the other one about the end of the attempted step
 (
-    HAS_SERIES,  # 1: the current series has been computed
-    CURRENT,  # index of the current series among the two stored series: 0 or 1
-    UNIT,  # unit of time of the current series (s)
+    HAS_SERIES,  # 1: the series about the beginning of the step has been computed; 0: not yet
+    CURRENT,  # index (0 or 1) of that one of the two stored series which is about the beginning of the step
+    UNIT,  # unit of time (s) of the series about the beginning of the step
     NEXT_UNIT,  # unit of time (s) of the series about the end of the last attempt
-    ALLOWED_SIZE,  # largest step size that the current series allows, in units of UNIT
+    ALLOWED_SIZE,  # largest step size that the series about its beginning allows, in units of UNIT
     NEXT_ALLOWED_SIZE,  # step size that the series about the end of the last attempt allows, in units of NEXT_UNIT
     TRIED,  # 1: the last attempt has computed the series about its end, for the next step if the attempt is accepted
     PASSED,  # time (s) from the state about which the series is computed to the beginning of the step; 0 if KEEP = 0
@@ -520,7 +520,7 @@ def _factor_after_large_defect(defect, order):
 
 @kernel(COMMIT)
 def commit_taylor(f, w, options, memory, tolerances, accepted):
-    """If the step was accepted, make the series about its end the current series, with which the next step begins."""
+    """After an accepted step, make the series about its end the one for the next step; else keep the present one."""
     if accepted and memory[TRIED] == 1.0:
         memory[CURRENT] = 1.0 - memory[CURRENT]
         memory[UNIT], memory[ALLOWED_SIZE] = memory[NEXT_UNIT], memory[NEXT_ALLOWED_SIZE]
