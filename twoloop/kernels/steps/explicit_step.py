@@ -95,8 +95,8 @@ def largest_error(tolerances, y, y1, fine_error, coarse_error, strict):
     e and d are the largest components of the error estimates `fine_error` and `coarse_error` (2 n, for positions and
     velocities), relative to atol + rtol |y|. The formula is not applied to each component separately: if the coarse
     estimate of a component passes through zero, its result would be e, which is of low order, and steps would need up
-    to 30 % more evaluations. If `strict`, return e^(3/2) / (e^2 + d^2)^(1/4) instead: near a singular position, terms of
-    high order are not small.
+    to 30 % more evaluations. If `strict`, return e^(3/2) / (e^2 + d^2)^(1/4) instead: near a singular position, terms
+    of high order are not small.
     """
     n = fine_error.size // 2
     rtol = tolerances[RTOL]
