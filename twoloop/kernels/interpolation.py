@@ -354,6 +354,8 @@ def fill_intervals(f, w, options, memory, memory_0, tolerances, state, new_state
         copy(states[i], out[first])
         copy(states[i + 1], out[last])
         code = renew_partition(f, w, t[i], state[:n])
+        if t[i + 1] - t[i] < n_rows * np.spacing(max(abs(t[i]), abs(t[i + 1]))):
+            code = SINGULAR  # times of successive states would coincide
         for r in range(first + 1, last):
             t_before = out_t[r - 1]
             out_t[r] = t[i] + (t[i + 1] - t[i]) * (r - first) / (n_rows - 1)
