@@ -25,8 +25,8 @@ MAX_VELOCITY_ROUNDING = 10.0
 # its pivot ratio is below SINGULAR_PIVOT, or below SINGULAR_PIVOT_RATIO times the larger one at the interval's ends
 SINGULAR_PIVOT_RATIO = 0.01
 SINGULAR_PIVOT = 1e-5
-# a position with a pivot ratio below WEAK_PIVOT is also singular if pivot ratio * (change of v by the projection) <
-# MAX_VIOLATION tolerances: this product estimates how much v violates the constraints, which is too little to matter
+# (pivot ratio) * (change of v by the projection) estimates by how much v violated the constraints. If this is less than
+# MAX_VIOLATION tolerances, rounding may explain the change: a position with a pivot ratio below WEAK_PIVOT is singular
 MAX_VIOLATION, WEAK_PIVOT = 10.0, 0.05
 
 
@@ -47,10 +47,10 @@ def _node_range(low, high, i, last):
 def _divided_differences(t, states, lo, hi, i, h, column, order, z, c):
     """Compute the Hermite polynomials through rows lo to hi of `states`; return the number of their coefficients.
 
-    Each of the n columns of `states` from index `column` on has a polynomial; it is zero at time t[i], because row i is
-    subtracted. The next n columns are first derivatives, and the next n second derivatives: polynomials interpolate
-    values and order - 1 derivatives. Store the coefficients of Newton's form in c, and the interpolated times in z, as
-    (time - t[i]) / h.
+    There are n polynomials, one for each of the n columns of `states` from index `column` on; the next n columns are
+    their first derivatives, and the next n their second derivatives. Row i is subtracted from the values. `order` is
+    the number of interpolated numbers at each time: 2 for a value and its first derivative, 3 with the second one.
+    Store the coefficients of Newton's form in c, and the interpolated times in z, as (time - t[i]) / h.
     """
     n = c.shape[1]
     n_coefficients = (hi - lo + 1) * order
@@ -107,10 +107,14 @@ def _kind_by_duration(kind, tolerances, h, states, i):
 
 @inlined
 def _fit_polynomials(tolerances, t, states, group, z_q, c_q, z_v, c_v):
-    """Store the polynomials of an interval: times z_q, coefficients c_q for q; z_v, c_v if v has its own polynomials.
+    """Compute the polynomials of an interval; `group` is its row in the table of intervals (data/indices.py).
 
-    `group`: row of the table of intervals (data/indices.py). Return the kind and duration (s) of the interval; indices
-    of the first and last interpolated state; number of values (with derivatives) per state; numbers of coefficients.
+    Store times z_q and coefficients c_q of the polynomials of q. Store z_v and c_v for v if the kind is SEPARATE.
+    Return
+    - the kind and the duration (s) of the interval
+    - the indices of the first and last interpolated state
+    - how many numbers of q the polynomials interpolate at each time: 2 (q, v) or 3 (q, v, a)
+    - the number of coefficients of each polynomial of q, and of v (0 if v has none)
     """
     i, last, kind = group[kinds.FIRST_OWN], group[kinds.LAST_OWN], group[kinds.KIND]
     h = t[last] - t[i]
@@ -208,7 +212,7 @@ def interpolate_states(f, w, tolerance, tolerances, t, states, groups, times, z,
 
 @merged
 def _state_difference(tolerances, scale_q, scale_v, states, i, q, v, q_other, v_other):
-    """Return the largest entry of scale_q |q - q_other| and of scale_v |v - v_other|, in tolerances at state i."""
+    """Return the largest scale_q |q - q_other| or scale_v |v - v_other|, in units of the tolerances for state i."""
     n = q.size
     rtol, largest = tolerances[RTOL], 0.0
     for m in range(n):
@@ -251,12 +255,14 @@ def estimate_errors(f, w, tolerance, tolerances, t, states, groups, z, coefficie
     """Store in out[g] the estimated error of the polynomials of interval g of `groups`, in units of the tolerances.
 
     The estimate is the first of these that applies (`tolerance`: of the projection; z, coefficients, rows: scratch):
-    - 0 if the polynomials do not interpolate accelerations (kinds SEPARATE and VELOCITIES), and have more than two
-      interpolated states at about equal distances, none of them inside the interval;
-    - if there are more than two of these: how much the last one changes the polynomials. This applies if it is at most
-      1, or if the kind is VELOCITIES, because the accelerations then contain the noise of stiff modes;
-    - the residual of the polynomials in the constraints and the equations of motion at CHECKED_FRACTIONS. A residual of
-      accelerations, times h / (number of coefficients), counts as an error of velocities.
+    - 0, if the kind is SEPARATE or VELOCITIES, and the polynomials interpolate more than two states, which are at about
+      equal distances and not inside the interval
+    - with more than two interpolated states: how much the polynomials change if they do not interpolate the last state.
+      This applies if the change is at most 1. It always applies to the kind VELOCITIES, because accelerations, which
+      the next estimate needs, then contain the noise of stiff modes
+    - the larger of two differences at CHECKED_FRACTIONS: of the state before and after its projection; and of the
+      accelerations by the polynomials and by the equations of motion. The latter, times h / (number of coefficients),
+      counts as an error of velocities
     """
     n = w.Q.size
     half = z.size // 2

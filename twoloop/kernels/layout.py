@@ -39,10 +39,10 @@ ArrayRanges = list[tuple[str, int, int, tuple[int, ...]]]  # for each array: nam
 class Layout(NamedTuple):
     """Offsets of the arrays of a workspace, which consists of a block of floats and a block of integers.
 
-    Kernels receive a table of the addresses and shapes of the arrays. `table` is this table with offsets (bytes) within
-    the blocks in place of addresses. Where entries of `of_numbers` (`of_integers`) are 1, the address of the block of
-    floats (integers) must be added; all others are 0. The first `n_lasting` floats and `n_lasting_integers` integers
-    keep data from one step to the next; a step fills all others before it reads them.
+    Kernels receive a table of the addresses and shapes of the arrays. `table` is this table, but with an array's offset
+    (bytes) within its block in place of its address. The masks `of_numbers` and `of_integers` are 1 where the address
+    of the block of floats, or of integers, must be added to `table`, and 0 elsewhere. The first `n_lasting` floats and
+    `n_lasting_integers` integers keep data from one step to the next; a step fills all others before it reads them.
     """
 
     numbers: ArrayRanges
@@ -97,7 +97,7 @@ def _allocate_workspace(sizes: Sizes) -> Work:
 
 
 def keep_unused_workspace(work: Work) -> None:
-    """Keep an unused workspace, unless it is large, for later runs of equal sizes; discard old ones over MAX_UNUSED."""
+    """Keep a workspace for later runs, unless it is large; over MAX_UNUSED, discard those of sizes used longest ago."""
     unused = _unused_workspaces.pop(work.sizes, [])
     if work.notes.base.size <= MAX_UNUSED_SIZE and len(unused) < MAX_UNUSED:
         unused.append(work)
@@ -129,7 +129,7 @@ def cached_run() -> Any:
 
 
 def _fixed_order_shapes(n_q: int, n_c: int, rank: int, form: FixedOrderSizes) -> tuple[dict[str, tuple[int, ...]], ...]:
-    """Return two dictionaries with the shapes of arrays (floats; integers) that the fixed-order form changes.
+    """Return the shapes of the arrays whose shapes differ in the fixed-order form: of floats, and of integers.
 
     The fixed-order form has no partition: all coordinates count as independent, and also as dependent, because steps
     compare all predicted positions with the positions on the constraints.
@@ -214,7 +214,7 @@ def _create_layout(
         "nodes": (n_nodes,),
         **dict.fromkeys(("mass_values", "jacobian_values", "is_independent", "factors", "pivot_sizes"), (0,)),
         **dict.fromkeys(("unknowns", "solutions"), (0,)),
-        "matrices": (n_matrices,),  # must be the last array, because it keeps no data from one step to the next
+        "matrices": (n_matrices,),  # must be the last array: it is scratch, which is not copied with a workspace
     }
     integers: dict[str, tuple[int, ...]] = {
         "row_entries": (n_rows + 1 + n_rows * n_q,),
@@ -225,7 +225,7 @@ def _create_layout(
         "row_order": (n_rows,),
         "counters": (N_COUNTERS,),
         "lapack": (N_ROUTINES,),
-        "index": (index_size(r),),  # must be the last array: its end keeps no data from one step to the next
+        "index": (index_size(r),),  # must be the last array: its end is scratch, which is not copied
     }
     rows_of_G, mass_side = n_rows + 1, n_q
     if fixed_order is not None:

@@ -3,23 +3,25 @@
 A traced program is the list of operations that a function does on symbols. If no callback computes C_q or Gamma, a
 program does (generate/derived_callbacks.py). Programs also compute forces, prescribed motions and constraint rows that
 the user of a model defines by functions (bodies/programs.py). The exact derivative of a function, such as tanh, may
-overflow where the function does not: then the caller does without the program. (`f`: the kit, `w`: the workspace)
+overflow where the function does not: then the caller uses, for example, finite differences. (`f`: the kit, `w`: the
+workspace)
 """
 
 import math
 
 from twoloop.kernels.data.common import compiled, exact
 
-# kinds of operations. SUM: a sum of terms and nothing else. RESULT: the same, for an output of a program. PENDING: a
-# product of two Taylor series; the coefficient of order k of the second series is not known until the linear equations
-# of order k, which contain the product, are solved
+# kinds of operations. SUM: a sum of terms, without a function. RESULT: the same, for an output of a program. PENDING,
+# in Taylor series: a product x y where the coefficient of order k of y is an unknown of the linear equations of order k
 PRODUCT, RECIPROCAL, SQUARE_ROOT, EXPONENTIAL, SINE, COSINE, LOGARITHM, ARCTANGENT, PENDING, SUM, RESULT = range(11)
-# columns of a table, which has one row for each operation. `nodes` are the numbers that a program reads and computes; a
-# term is a coefficient times one of them. KIND: kind of the operation. NODE: index of its result in `nodes`. Argument
-# 1 is a constant plus the terms FIRST to SECOND - 1; argument 2 is a constant plus the terms SECOND to END - 1
+# columns of the table of a program, which has one row for each operation. `nodes` are the numbers that the program
+# reads and computes. Each argument of an operation is a constant plus terms; a term is a coefficient times a node.
+# - KIND: kind of the operation, such as SINE; NODE: index of its result in `nodes`
+# - FIRST, SECOND, END: in the list of terms, argument 1 has the terms FIRST to SECOND - 1, argument 2 SECOND to END - 1
 KIND, NODE, FIRST, SECOND, END, N_COLUMNS = range(6)
-# A program is a vector of integers: N_SIZES sizes (at the indices below); the rows of the table; for each term, its
-# index in `nodes`; for each result, its index in w.Gamma or in the flattened C_q. The last of `nodes` are the results
+# indices in a program, a vector of integers that begins with four sizes: the numbers of nodes, rows, terms and results.
+# The rows of the table follow; then, for each term, the index of its node; then, for each result, its index in w.Gamma
+# or in the flattened C_q. The last nodes are the results
 N_NODES, N_ROWS, N_TERMS, N_RESULTS, N_SIZES = range(5)
 
 
@@ -49,7 +51,7 @@ def result_of_operation(kind, x, y):
 
 @exact
 def affine_sum(nodes, table, columns, numbers, coefficients, constant, begin, end):
-    """Return numbers[constant] + sum of (coefficient k) * (its entry of `nodes`), begin <= k < end; see `run_table`."""
+    """Return an argument of an operation: numbers[constant] plus its terms `begin` to end - 1, see `run_table`."""
     total = numbers[constant]
     for k in range(begin, end):
         total = total + numbers[coefficients + k] * nodes[int(table[columns + k])]
@@ -86,7 +88,7 @@ def _run_program(program, numbers, nodes, t, q, v):
 
 @exact
 def _result_indices(program):
-    """Return the number of results, their first index in `nodes`, and where `program` lists their output indices."""
+    """Return the number of results, and indices: of the first in `nodes`, and of their output indices in `program`."""
     n = program[N_RESULTS]
     return n, program[N_NODES] - n, N_SIZES + N_COLUMNS * program[N_ROWS] + program[N_TERMS]
 

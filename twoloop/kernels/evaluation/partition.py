@@ -39,7 +39,8 @@ from twoloop.kernels.linalg.markowitz_lu import (
 RANK_TOLERANCE = 1e-11  # pivots up to this limit count as zero, if rows are scaled to maxima of 1 first
 PARTITION_CHANGED = -1  # return code: the task succeeded, as for DONE, and the partition has changed
 MAX_ROWS_ELIMINATED = 200  # with more independent constraints, `min_pivot_ratio` does no elimination, to save time
-SENSITIVITY_GROWTH = 3.0  # a partition is poor if the sensitivity of dependent coordinates has grown by this factor
+# a partition is poor if the sensitivity of its dependent coordinates exceeds this multiple of the first known value
+SENSITIVITY_GROWTH = 3.0
 
 
 @compiled
@@ -130,7 +131,7 @@ def min_pivot_ratio(f, w, t, q):
 
 @compiled
 def _pivot_rows(w, n_rows, max_rank):
-    """Choose at most `max_rank` pivots in the first `n_rows` rows of w.Gx; store their order in w; return the rank."""
+    """Eliminate in the first `n_rows` rows of w.Gx by full pivoting; store w.order, w.row_order; return the rank."""
     for j in range(w.order.size):
         w.order[j] = j
     for i in range(w.row_order.size):
@@ -152,7 +153,7 @@ def _find_pivot_order(w, max_rank, max_rank_v):
     w.pivot = abs(G[rank - 1, rank - 1]) if rank > 0 else 1.0
     if n_rows == n_c:
         return rank, rank
-    last = rank  # rows before this index may get pivots: each row of A is exchanged with a redundant row of C_q
+    last = rank  # rows before this index may get pivots: the loop exchanges rows of A with redundant rows of C_q
     for i in range(n_c, n_rows):
         row_order[last], row_order[i] = row_order[i], row_order[last]
         for j in range(G.shape[1]):
@@ -223,7 +224,7 @@ def write_programs(w):
 
 @compiled
 def _record_columns_of_entries(w):
-    """Store in w.row_entries where the list of each row begins, then these lists: the columns where w.pattern is 1."""
+    """Store the columns where row i of w.pattern is 1 in w.row_entries[w.row_entries[i] : w.row_entries[i + 1]]."""
     n_rows = w.Rate.size
     index = n_rows + 1
     for i in range(n_rows):
@@ -237,7 +238,7 @@ def _record_columns_of_entries(w):
 
 @compiled
 def record_entries(w):
-    """Set w.pattern to 1 where w.G is not zero; return True if w.pattern changes: elimination needs new programs."""
+    """Set w.pattern to 1 where w.G is not zero; return True if an entry is new: eliminations need new programs."""
     if not update_pattern(w.G, w.pattern):
         return False
     w.index_a[SIZE] = 0
@@ -270,15 +271,15 @@ def choose_partition(f, w, t, q):
 
 @compiled
 def adopt_partition_of_midpoint(f, w, t_mid, state, new_state):
-    """Adopt the partition that full pivoting chooses at the middle of an attempted step.
+    """Adopt the partition that full pivoting chooses at the middle of an attempted step; return a code.
 
-    Codes: PARTITION_CHANGED (the caller repeats the step), DONE (the partition was the same) or SINGULAR. The same step
-    backwards in time has the same middle and thus the same partition, so that a step by a symmetric tableau is
-    symmetric in time. If a partition were used until it is poor, it would depend on the direction of time.
+    Codes: PARTITION_CHANGED (the caller repeats the step), DONE (the partition was the same) or SINGULAR. The purpose
+    is symmetry in time: the same step taken backwards has the same middle, and thus the same partition. A partition
+    that is used until it is poor would depend on the direction of time.
 
-    The middle is the mean of the states at the beginning (`state`) and end (`new_state`) of the attempted step. When
-    the step is repeated, the choice is not checked again. So the step backwards may choose another partition if two
-    partitions are equally good within the difference between the attempts, O(h^(p+1)) for order p.
+    The middle is the mean of the states at the beginning (`state`) and end (`new_state`) of the attempted step. The
+    repeated step ends at a slightly different state (difference O(h^(p+1)) for order p), for which the choice is not
+    made again. So symmetry is lost if two partitions are equally good up to this difference.
     """
     n = w.Q.size
     for j in range(n):
@@ -323,7 +324,7 @@ def choose_oriented_partition(f, w, t, q):
 
 @compiled
 def _largest_coefficient(w):
-    """Return the largest |coefficient| in combinations of independent rows that equal redundant rows; row maxima: 1."""
+    """Return the largest |coefficient| of an independent row in a redundant row, for rows scaled to maxima of 1."""
     rows = rows_of(w.index_v)
     largest = 0.0
     begin = 0
@@ -355,7 +356,8 @@ def partition_is_poor(w):
         w.sensitivity = max(largest, 1.0)
     if not largest <= SENSITIVITY_GROWTH * w.sensitivity:
         return True
-    # without redundant rows, there is no coefficient; the fixed-order form (w.factors not empty) checks its rows itself
+    # no coefficient is checked without redundant rows, nor in the fixed-order form (w.factors not empty), which chooses
+    # other independent rows when its factors show that some have become dependent
     if w.rows_v.size == w.Rate.size or w.factors.size > 0:
         return False
     coefficient = _largest_coefficient(w)
@@ -367,12 +369,13 @@ def partition_is_poor(w):
 MAX_ITERATIONS = 25  # largest number of Newton iterations for positions; quadratic convergence needs 2 to 5
 CONTRACTION = 0.5  # Newton's method counts as converging while each correction is at most this part of the previous one
 ROUNDING_OF_CORRECTIONS = 1e-12  # corrections of positions up to this size, relative to max|q|, may be due to rounding
-# if all constraints hold up to rounding, the limit ROUNDING_OF_CORRECTIONS is multiplied by this factor, because small
-# bodies amplify errors: the rounding error of a position of 1 m turns a rod of 1 mm by 1e-13 rad, a chain by more
+# if all constraints hold up to rounding, larger corrections may be due to rounding: up to this factor times
+# ROUNDING_OF_CORRECTIONS. A rounding error of a position of 1 m turns a rod of 1 mm by 1e-13 rad, a chain by more
 AMPLIFICATION = 1e3
-# constraint i holds up to rounding if |C_i| is at most this fraction of the largest |G_ij q_j| over j; G: Jacobian C_q
+# constraint C_i = 0 holds up to rounding if |C_i| is at most this fraction of its largest term: the largest |G_ij q_j|
+# over the coordinates q_j, with the Jacobian G = C_q
 ROUNDING_OF_ROWS = 2e-15
-MIN_CORRECTION = 10.0  # smallest tolerance of corrections in a projection, divided by w.rounded (rounding error of q)
+MIN_CORRECTION = 10.0  # a projection's tolerance for corrections is at least this number times w.rounded, rounding of q
 # constraint i is violated if |C_i| exceeds this fraction of max(1, max|q|) times the largest entry of its Jacobian row,
 # or if |(C_q v + C_t)_i| exceeds this fraction of max(1, max|v|) times this entry
 MAX_VIOLATION = 1e-7
@@ -435,8 +438,9 @@ def _is_on_constraints(w, q):
 def restore_positions(f, w, t, q, v, tolerance, reuse_limit):
     """Solve C(t, q) = 0, eq. (15) of the paper, by Newton's method for the dependent positions in q; return a code.
 
-    The iteration ends after a correction of at most `tolerance`. Then the Jacobian and its factors in w are renewed at
-    q, unless the last correction was at most `reuse_limit`. The callback `kinematics`, if given, also stores Gamma.
+    The iteration ends after a correction of at most `tolerance`. If this correction was larger than `reuse_limit`, the
+    Jacobian is then evaluated and factored again at the final q; otherwise w keeps those from before the correction.
+    The callback `kinematics`, if the user gave one, evaluates C, C_q and gamma (w.Gamma) together.
     """
     last_correction = np.inf
     has_converged = w.C.size == 0
@@ -478,7 +482,11 @@ def restore_positions(f, w, t, q, v, tolerance, reuse_limit):
 
 @merged
 def find_null_space(f, w, t, q):
-    """Store in w.D the null space of the Jacobian w.G and, in its last row, the dependent velocities due to drives."""
+    """Store in w.D how dependent velocities follow from independent ones, by the factors of the Jacobian w.G.
+
+    Row j of w.D: dependent velocities if independent velocity j is 1 and the others are 0, without drives. These rows
+    represent the null space of w.G. Last row: dependent velocities due to drives, if all independent ones are 0.
+    """
     if f.kinematics_given == 0 or w.has_gamma == 0.0:
         constraint_rates(f, w, t, q, w.Rate)
     gather_independent_columns(w.G, w.Rate, rows_of(w.index_v), w.independent_v, w.D)

@@ -69,14 +69,15 @@ from twoloop.kernels.linalg.symbolic_factorization import (
 SUSPECT_PIVOT = 1e-6  # up to this squared sine, the pivot may be a rounding error: check whether the row is redundant
 MIN_PIVOT = 1e-10  # factors are accurate if pivot / (squared norm of the row) exceeds this for all independent rows
 MAX_DEPENDENT_SINE = 1e-11  # a row is redundant if the sine of its angle to the independent rows' span is at most this
-PROJECT_STAGES = 2.0  # value of w.nearly_singular that means: project stages onto the constraints before evaluations
-# solutions are refined once (twice) if the smallest pivot / (squared norm of its row) is at most the first (second)
+PROJECT_STAGES = 2.0  # value of w.nearly_singular near singular positions: stages are projected before evaluations
+# limits of the smallest pivot / (squared norm of its row of C_q): solutions are refined iteratively, once if it is at
+# most the first limit, and twice if it is at most the second
 REFINE_ONCE_BELOW, REFINE_TWICE_BELOW = 1e-3, 1e-7
 
 
 @compiled
 def fill_mass_values(f, w, t, q):
-    """Store the entries of M(t, q) in w.mass_values; those of a constant dense M have been there since the start."""
+    """Store the entries of M(t, q) in w.mass_values. Do nothing if M is constant and dense: they are stored once."""
     if f.mass_values_given == 1:
         w.mass_values[:] = 0.0
         f.mass_values(t, q, f.p, w.mass_values)
@@ -109,7 +110,8 @@ def fill_jacobian_values(f, w, t, q):
 def _factor_entries(f, w, min_sine_square):
     """Factor [M G^T; G 0]; return the smallest sin^2 of the angle between a row of G and the span of previous rows.
 
-    Rows with a sin^2 up to `min_sine_square` become redundant, and do not count. M not positive definite: return -1.
+    Rows with a sin^2 up to `min_sine_square` are marked as redundant and left out, also from the returned minimum. If M
+    is not positive definite, return -1.
     """
     w.n_factorizations += 1
     stiffness = w.solutions[3 * f.ldl_program[N_PIVOTS] :]
@@ -148,7 +150,7 @@ def factor_equations_at(f, w, t, q):
 
 @compiled
 def solve_unknowns(f, w, n_corrections):
-    """Replace the right-hand side in w.unknowns by the solution, with `n_corrections` steps of iterative refinement."""
+    """Solve [M G^T; G 0] x = b; x replaces b in w.unknowns. Refine x iteratively, `n_corrections` times."""
     n = f.ldl_program[N_PIVOTS]
     scratch = w.solutions
     return solve_refined(
@@ -204,7 +206,8 @@ def _count_independent(is_independent):
 def _choose_rows(f, w, t, q):
     """Set w.is_independent to 1 for independent rows of G, else to 0; factor [M G^T; G 0] with these; return a code.
 
-    Rows with pivots up to SUSPECT_PIVOT are left out first, then added one by one if independent of the chosen rows.
+    First, leave out all rows with pivots up to SUSPECT_PIVOT. Then add each of them that is not a combination of the
+    rows chosen so far.
     """
     w.is_independent[:] = 1.0
     if not _factor_entries(f, w, SUSPECT_PIVOT) > 0.0:
@@ -256,7 +259,9 @@ def choose_rows(f, w, t, q):
     return _adopt_rows(w)
 
 
-REGULARIZATION = 1e-11  # diagonal entry j of W (module docstring), relative to the sum of squares of column j of C_q
+# the diagonal matrix W of the module docstring makes a system regular; its entry j is this fraction of the sum of
+# squares of column j of C_q
+REGULARIZATION = 1e-11
 CONVERGED_RESIDUAL = 1e-14  # multipliers are refined until reactions agree with the given ones up to this fraction
 MAX_RESIDUAL = 1e-9  # if refinements help no more, multipliers are accepted if reactions agree up to this fraction
 MAX_SOLUTIONS = 30  # largest number of refinements of the multipliers of least norm
@@ -288,9 +293,10 @@ def _fill_least_norm_matrix(program, jacobian, n_q, weights, values):
 
 @compiled
 def _fill_residual(program, jacobian, force, x, r):
-    """Store the residual [p - G^T lam, lam - G x] in r; return max|p - G^T lam| / max|p|.
+    """Store in r the residual of the equations of the module docstring; return max|p - G^T lam| / max|p|.
 
-    The argument x contains [x, lam]. p: `force`, reactions that the multipliers lam must have; G: Jacobian `jacobian`.
+    The residual is [p - G^T lam, lam - G y]. The argument x contains the approximate solution, first y, then the
+    multipliers lam. p (`force`): the reactions that lam must have; `jacobian`: entries of the constraint Jacobian G.
     """
     n_q, largest, residual = force.size, 0.0, 0.0
     copy(force, r[:n_q])
@@ -407,7 +413,7 @@ def _compute_multipliers(f, w, lam):
 
 @compiled
 def _find_least_correction(f, w):
-    """Store in w.unknowns[:n] the x with C_q x = w.g and least x^T M x; return max|x|, or inf if it is not finite."""
+    """Store in w.unknowns[:n_q] the solution x of C_q x = w.g with the least x^T M x; return max|x|, inf for a NaN."""
     n = w.unknowns.size - w.g.size
     w.unknowns[:n] = 0.0
     copy(w.g, w.unknowns[n:])
@@ -430,13 +436,13 @@ def _is_on_constraints(f, w, q):
 
 
 @compiled
-def _project_state(f, w, t, q, v, theta):
-    """Project (q, v) onto the constraints in place, until corrections are at most theta; return a code.
+def _project_state(f, w, t, q, v, tolerance):
+    """Project (q, v) onto the constraints in place, until corrections are at most `tolerance`; return a code.
 
-    On return, the factors in w belong to q before the last correction.
+    On return, the factors in w are those at q before the last correction.
     """
     last_correction = np.inf
-    theta = max(theta, MIN_CORRECTION * w.rounded)
+    tolerance = max(tolerance, MIN_CORRECTION * w.rounded)
     for _ in range(MAX_ITERATIONS):
         code = factor_equations_at(f, w, t, q)
         if code != DONE:
@@ -459,11 +465,12 @@ def _project_state(f, w, t, q, v, theta):
         correction_q = _find_least_correction(f, w)
         if not np.isfinite(correction_q):
             return not_finite(w, CONSTRAINT, t, q)
-        is_last = correction_q <= theta and correction_v <= theta * max(1.0, largest_of(v))
-        is_last = is_last or correction_q <= w.pivot * theta
+        is_last = correction_q <= tolerance and correction_v <= tolerance * max(1.0, largest_of(v))
+        is_last = is_last or correction_q <= w.pivot * tolerance
         if not is_last and correction_q > CONTRACTION * last_correction:
             limit = ROUNDING_OF_CORRECTIONS * largest_of(q)
-            # do not apply this correction: rounding errors in it would move light bodies much more than heavy ones
+            # corrections do not become smaller: succeed only if this one may be due to rounding. It is not applied,
+            # because its rounding errors would move light bodies much more than heavy ones
             return (
                 DONE
                 if correction_q <= limit or (correction_q <= AMPLIFICATION * limit and _is_on_constraints(f, w, q))
@@ -473,7 +480,7 @@ def _project_state(f, w, t, q, v, theta):
             q[j] += w.unknowns[j]
         if is_last:
             return DONE
-        last_correction = max(correction_q, theta)
+        last_correction = max(correction_q, tolerance)
     return INNER_DIVERGED
 
 
@@ -499,7 +506,7 @@ def _check_redundant_rows(f, w, t, q, v):
 
 @compiled
 def _do_task_between_evaluations(f, w, task, t, q, v, a, lam):
-    """Do a task other than evaluations and projections; return a code (NEEDS_DENSE: only dense forms can do it)."""
+    """Do a task other than evaluations and projections; return its code, or NEEDS_DENSE if only dense forms do it."""
     if task == tasks.FIND_NULL_SPACE:
         return factor_equations_at(f, w, t, q)
     if task == tasks.RENEW_PARTITION:
@@ -516,7 +523,10 @@ def _do_task_between_evaluations(f, w, task, t, q, v, a, lam):
 
 @kernel(INNER)
 def sparse_inner_loop(f, w, task, t, q, v, tolerance, a, lam):
-    """Do `task` (see tasks.py) by sparse factors; return a code. SOLVE: q, v are r, c in M a + G^T lam = r, G a = c."""
+    """Do a `task` (see tasks.py) at the state (q, v) by sparse factors; return a code.
+
+    The task SOLVE solves M a + G^T lam = r and G a = c (G: constraint Jacobian); then q contains r, and v contains c.
+    """
     if task in (tasks.EVALUATE, tasks.EVALUATE_WITHOUT_PROJECTION):
         code = STOPPED if w.time_is_up == 1.0 else DONE
         if code == DONE and task == tasks.EVALUATE and w.nearly_singular == PROJECT_STAGES:
@@ -537,5 +547,5 @@ def sparse_inner_loop(f, w, task, t, q, v, tolerance, a, lam):
     if code != DONE:
         return code
     code = _compute_multipliers(f, w, lam)
-    # a dense form is needed if w.M has nonzero entries other than those for which the program was written
+    # if w.M has nonzero entries that the elimination program does not read, the accelerations are wrong: NEEDS_DENSE
     return code if w.M.size == 0 or not has_new_entries(w.M, w.mass_pattern) else NEEDS_DENSE

@@ -21,7 +21,8 @@ from twoloop.kernels.lanes.layout import (
     remove_run,
 )
 
-# indices in `options`, after N_RULE numbers of the step-size rule; the options of the method, as outside lanes, follow
+# indices in `options`, a vector that contains the N_RULE numbers of the step-size rule, then the following numbers, and
+# from index N_HEAD on the options of the method
 # - JUMP_RATIO: assumed largest ratio of true error to error estimate in a step in which a force jumps
 # - FIRST: first step size, relative to the shortest time scale at the start; LEAST: smallest tolerance of a coordinate
 JUMP_RATIO, FIRST, LEAST, N_HEAD = range(N_RULE, N_RULE + 4)
@@ -80,9 +81,10 @@ def begin_control(options, control, work, n, state, a, start):
 
 @compiled
 def choose_steps(work, control, status, n_steps):
-    """Store the size of the next step, at most control[GAP] (s), in H and X; remove runs whose steps are too short.
+    """Store the size of the next step, at most control[GAP] (s), in H and X; set ACTIVE to 1 in lanes with a run.
 
-    Runs with MAX_STEPS steps are removed, too. In lanes without a run, H, X and ACTIVE become 0; else ACTIVE becomes 1.
+    Remove a run if its steps are too short, or if it has taken MAX_STEPS steps. In lanes without a run, H, X and ACTIVE
+    become 0.
     """
     t1 = control[at.T1]
     for k in range(LANES):
@@ -107,7 +109,7 @@ def choose_steps(work, control, status, n_steps):
 
 @compiled
 def set_end(work, control):
-    """Set T_NEW, the time of the new state, to T + X (beginning of the step plus time since then); at the end: t1."""
+    """Set T_NEW, the time of the new state, to T + X or, at the end of the run, exactly to t1 (no rounding error)."""
     for k in range(LANES):
         t, x = work[at.T * LANES + k], work[at.X * LANES + k]
         work[at.T_NEW * LANES + k] = control[at.T1] if x == control[at.T1] - t else t + x
@@ -115,10 +117,11 @@ def set_end(work, control):
 
 @compiled
 def end_steps(code, settings, control, work, predicted_v):
-    """Project NEW, the state at the end of the step, onto the constraints; include the changes in the error estimate.
+    """Project NEW, the state at the end of the step, onto the constraints; raise ERROR to the changes that this causes.
 
-    If a change of velocities, in tolerances, or PREDICTION_ERROR, for positions, is larger than ERROR, it replaces
-    ERROR: so a step is rejected if a drive has a jump or kink between its stages. `predicted_v`: offset of scratch.
+    ERROR is the error estimate of the step. It becomes the largest of three numbers: ERROR, the largest change of a
+    velocity in tolerances, and PREDICTION_ERROR, for positions. So a step is rejected if a drive has a jump or
+    kink between its stages, which its estimate does not show. `predicted_v`: offset of scratch.
     """
     n, order = settings[at.N], settings[at.ORDER]
     state, new, predicted, _, _, _, _, _ = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])

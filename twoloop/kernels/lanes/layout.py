@@ -60,11 +60,12 @@ LANES = 8 if has_wide_vectors() else 4  # number of runs at once: the number of 
     JUMP_END,  # time (s) at the end of the last step that was rejected with an error above SUDDEN_ERROR
     SHIFT,  # number from 0 to 1 that shifts the times of evaluations of the defect within a step
     EVALUATED,  # number of evaluations within the step, in addition to settings[N_EVALUATIONS]
-    PAST,  # size and error of the last accepted step, for step-size control; stored lane by lane
+    PAST,  # size and error of the last accepted step, for step-size control: both of lane 0, then both of lane 1, ...
     _MORE_PAST,
     N_FIELDS,
 ) = range(31)
-# names of generated functions, called with (order, control, work); generate/lane_code.py writes them
+# names of functions that are generated for each mechanism; methods of the same names, such as `commit` in
+# generate/lane_code.py, write them. Arguments: order of the Taylor series, settings `control`, memory `work`
 TASKS = ("correct_positions", "correct_state", "check_redundant_rows", "compute_prediction_error", "commit")
 TASKS_OF_STARTS, TASKS_OF_STAGES, TASKS_OF_EXPLICIT = ("compute_rows",), ("compute_accelerations",), ("compute_stages",)
 TASKS_OF_SERIES = (
@@ -90,7 +91,7 @@ START, BEGIN, _BEGIN_V, PREDICTED_V, SLOPES = range(5)
     N,  # number of coordinates
     N_ROWS,  # number of constraints
     ORDER,  # order of the Taylor series
-    CHECKS_REDUNDANT,  # 1: redundant rows must be checked at the end of each step
+    CHECKS_REDUNDANT,  # 1: redundant constraints are checked at the end of each step; 0: they are not
     N_NUMBERS,  # number of coefficients that the generated code reads
     N_EVALUATIONS,  # number of evaluations of accelerations within a step
 ) = range(6)
@@ -185,16 +186,16 @@ def add_product(work, target, x, y, sign):
 
 @merged
 def _raised_value(work, target, error, factor, before, after, atol, rtol):
-    """Return the value that `raise_to_ratio` stores in one lane; arguments up to `after` are indices in `work`."""
+    """Return the new number at `target` in one lane, see `raise_to_ratio`; arguments up to `after` are indices."""
     allowed_error = atol + rtol * max(abs(work[before]), abs(work[after]))
     return max(work[target], abs(work[error]) * work[factor] / allowed_error)
 
 
 @compiled
 def raise_to_ratio(work, target, error, factor, before, after, atol, rtol):
-    """In each lane, raise the number at `target` to |error| * factor / (atol + rtol * max(|before|, |after|)).
+    """In each lane, raise the number at `target` to the ratio of an error to its tolerance, if this is larger.
 
-    `target`, `error`, `factor`, `before` and `after` are offsets.
+    The ratio is |error| * factor / (atol + rtol * max(|before|, |after|)); all names but atol and rtol are offsets.
     """
     for k in range(0, LANES, 4):
         m, e, f, x, y = target * LANES + k, error * LANES + k, factor * LANES + k, before * LANES + k, after * LANES + k

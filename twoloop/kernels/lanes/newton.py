@@ -60,14 +60,14 @@ from twoloop.kernels.steps.velocity_errors import LONGEST_GAPS, SLOW_FACTOR, STE
 # indices of blocks of n vectors in the method's memory (n: number of coordinates)
 (
     START,  # accelerations at the beginning of the next step
-    BEGIN_Q,  # q, v and a at the beginning of this step
+    BEGIN_Q,  # q at the beginning of this step; the next two blocks: v and a there
     BEGIN_V,
     BEGIN_A,
     SUMS,  # scratch
-    MIDDLE_Q,  # q, v and a in the middle of the step
+    MIDDLE_Q,  # q in the middle of the step; the next two blocks: v and a there
     MIDDLE_V,
     MIDDLE_A,
-    E_Q,  # estimated errors of q and v at the end of the step
+    E_Q,  # estimated error of q at the end of the step; the next block: of v
     E_V,
     UNFILTERED,  # estimated error of v before filters
     FILTERED_ONCE,  # estimated error of v after one filter
@@ -75,11 +75,12 @@ from twoloop.kernels.steps.velocity_errors import LONGEST_GAPS, SLOW_FACTOR, STE
     _IMAGINARY,  # scratch: imaginary part of the right-hand side and solution of a linear system
     N_VECTORS,
 ) = range(15)
-# indices of blocks (s, n), for s stages: accelerations at the stages of this step; those of the previous step;
-# residuals of Newton's method; its corrections of the accelerations. The weights (s, s) follow these blocks
+# indices of blocks of s n vectors (s stages, n coordinates) in the method's memory
+# - STAGES: accelerations at the stages of this step; PREVIOUS: those of the previous step
+# - RESIDUAL: residuals of Newton's method; CHANGES: its corrections of the accelerations
 STAGES, PREVIOUS, RESIDUAL, CHANGES, N_BLOCKS = range(5)
-# indices of matrices (n, n): derivatives of the accelerations by q and by v; then, for each linear system of Newton's
-# method, the real and the imaginary part of its matrix. The pivots follow the matrices
+# indices of matrices (n, n) in the method's memory. DERIVATIVE_Q, DERIVATIVE_V: derivatives of the accelerations by q
+# and by v. From SYSTEMS on: for each linear system of Newton's method, the real and the imaginary part of its matrix
 DERIVATIVE_Q, DERIVATIVE_V, SYSTEMS = range(3)
 
 
@@ -197,8 +198,9 @@ def factor_systems_of_lanes(settings, method_options, s, work):
 def predict_stages(settings, c, work, begins):
     """Store in STAGES a prediction of the stage accelerations: the polynomial through those in PREVIOUS.
 
-    If the step is longer than MAX_STEP_RATIO times the step of PREVIOUS, the accelerations at its beginning are used.
-    `begins` is 1 if PREVIOUS belongs to the last step, and 0 if it belongs to this step.
+    If X is larger than MAX_STEP_RATIO times the size of the step of PREVIOUS, the polynomial would be extrapolated too
+    far: then all predictions are the accelerations at the beginning of the step. `begins` is 1 if the stages belong to
+    the step after that of PREVIOUS, and 0 if they belong to the same step.
     """
     n = settings[at.N]
     memory = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])[7]
@@ -374,7 +376,7 @@ def solve_stages(code, settings, control, options, method_options, A, A2, c, wor
 
 @compiled
 def store_state_from_stages(settings, b, bA, work):
-    """Store in NEW the state at the time X after the step's beginning, from STAGES, with the weights b and bA = b A."""
+    """Store in NEW the state X s after the step's beginning; STAGES have weights b for v, and bA = b A for q."""
     n = settings[at.N]
     _, new, _, _, _, _, _, memory = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])
     s = b.size
@@ -446,7 +448,11 @@ def _filter_errors(settings, method_options, s, work, memory):
 
 @compiled
 def _filtered_velocity_error(control, work, n, memory, z, state, new, k):
-    """Return the largest error of q or v, in tolerances, that the velocity error E_V causes; see velocity_errors.py."""
+    """Return the largest error of q or v, in tolerances, that the velocity error E_V of the step causes in lane k.
+
+    Store DURATION, the estimated time until the velocity error decays or changes its sign. The error of a position is
+    about the velocity error times this time, see velocity_errors.py. z: time (s), see `_filter_errors`.
+    """
     raw, once, twice = (
         vector_offset(memory, n, UNFILTERED),
         vector_offset(memory, n, FILTERED_ONCE),
@@ -481,7 +487,7 @@ def _velocity_error(control, work, n, velocity_error, duration, state, new, k):
 
 @merged
 def _motion_time(control, work, n, memory, k):
-    """Return (largest velocity) / (largest acceleration) (s) in lane k, at most LONGEST_GAPS * control[GAP]."""
+    """Return max|v| / max|a| (s) at the beginning of the step in lane k, at most LONGEST_GAPS * control[GAP]."""
     begin = vector_offset(memory, n, BEGIN_V)
     largest_v = largest_a = 0.0
     for j in range(n):
@@ -493,7 +499,7 @@ def _motion_time(control, work, n, memory, k):
 
 @compiled
 def _add_error_in_slow_directions(settings, control, method_options, s, work):
-    """Raise ERROR to the error, in tolerances, that the slowly changing part of E_V causes; see velocity_errors.py."""
+    """Raise ERROR if the slowly changing part of the velocity error E_V causes a larger one; see velocity_errors.py."""
     n = settings[at.N]
     state, new, _, _, _, _, _, memory = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])
     e_v, error_field, fine_copy = vector_offset(memory, n, E_V), memory + LARGEST_V, memory + ITERATING

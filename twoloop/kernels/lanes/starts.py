@@ -28,7 +28,7 @@ GOLDEN_SECTION = 0.6180339887498949  # inverse iterations start from irregular n
 
 @merged
 def _subtract_in_four_lanes(work, target, x, x_stride, y, y_stride, count):
-    """For four adjacent lanes, subtract from work[target] `count` products work[x] * work[y]; x, y grow by strides."""
+    """In four adjacent lanes, subtract `count` products work[x] * work[y] from work[target]; x, y grow by strides."""
     t0, t1, t2, t3 = work[target], work[target + 1], work[target + 2], work[target + 3]
     for _ in range(count):
         t0 -= work[x] * work[y]

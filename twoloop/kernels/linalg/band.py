@@ -166,7 +166,10 @@ def _scratch_view(numbers, n, n_c, b):
 
 @compiled
 def factor_bordered(w, b, Cq, numbers, pivots, factorize, substitute):
-    """Factor [[B, Cq^T], [Cq, 0]], B in `numbers`, by `factorize`, `substitute` (as DGBTRF, DGBTRS); return a code."""
+    """Factor [[B, Cq^T], [Cq, 0]], where `numbers` contains the banded matrix B; return DONE or SINGULAR.
+
+    `factorize`, `substitute`: indices of the LAPACK routines, DGBTRF and DGBTRS, or the complex ZGBTRF and ZGBTRS.
+    """
     n_c, n = Cq.shape
     band = lu_band(numbers, n, b)
     exchanges = pivots[: n - n_c].view(np.int32)

@@ -129,9 +129,10 @@ def lu_solve(A, pivots, x):
 
 @merged
 def ldl_factor(A):
-    """Factor a symmetric A = U^T D^-1 U in its upper triangle; D = diag(U) contains the pivots d_k.
+    """Factor a symmetric matrix A = U^T D^-1 U in place; return False if A is not positive definite or not finite.
 
-    Store 1/d_k on the diagonal, and the rest of U above it. Return False if A is not positive definite or not finite.
+    U is upper triangular; D, its diagonal, contains the pivots d_k. Store 1/d_k on the diagonal of A, and the other
+    entries of U above it. Entries below the diagonal are neither read nor changed.
     """
     n = A.shape[0]
     for k in range(n):

@@ -6,12 +6,14 @@ the pivot is not the largest but the one that causes the least fill-in: so nearb
 
 from twoloop.kernels.data.common import INTEGERS, MATRIX, VECTOR, compiled, i8, kernel, merged
 
-# In this module, R contains the rows of G during the elimination; K (same shape) the kinds of their entries: always
-# zero, constant, varying. `columns[i]` lists the columns of entries of row i, and row_sizes[i] is their number
+# kinds of entries of the constraint Jacobian G: always zero; constant, not zero; varying with the position.
+# In this module, R contains the rows of G during the elimination, and K (same shape) the kinds of their entries.
+# columns[i] lists the columns of the entries of row i whose kind is not NONE; row_sizes[i] is their number
 NONE, NUMBER, VARIES = 0, 1, 2
 ROWS_SEARCHED = 4  # to save time, pivot blocks are sought only in this number of rows, which have the fewest entries
-# limits for a pivot block: three pairs, tried in this order until a block meets one; each pair is looser
-# - MAX_SQUARES: largest sum of squares of the changes of the block's coordinates if each other coordinate moves by 1
+# limits for a pivot block: three pairs, tried in this order until a block meets both limits; later ones are looser
+# - MAX_SQUARES: the block's equations determine its coordinates from the others; this limits the sum of the squares of
+#   the coefficients of the others
 # - MIN_SINE_SQUARES: smallest squared sine of the angle between the columns of two pivots; for a single pivot, smallest
 #   squared ratio of the pivot to the norm of its column of G
 # With the first pair, pivots stay large for 98 % of a turn of a spatial four-bar, with the second for 34 %. The last
@@ -28,7 +30,7 @@ def scratch_sizes(n_rows: int, n: int) -> tuple[int, int]:
 
 @compiled
 def _find_constant_pivot(R, K, columns, row_active, row_sizes, column_sizes):
-    """Return n * row + column (R has n columns) of the constant entry with the least fill-in as a pivot; -1: none."""
+    """Return row * n + column of the constant pivot with the least fill-in; -1: none is found. R has n columns."""
     best, best_fill, best_size, (m, n) = -1, 0, 0, R.shape
     for i in range(m):
         if not row_active[i]:
@@ -153,7 +155,7 @@ def _subtract_multiple(R, K, columns, row_sizes, column_sizes, union, r, j, i):
 
 @compiled
 def _eliminate(R, K, columns, row_active, row_sizes, column_sizes, union, i, k, j, l):
-    """Solve rows i, k of a pivot block for the coordinates of its columns j, l; eliminate these from all other rows."""
+    """Solve rows i, k of a pivot block for the coordinates of columns j, l; eliminate these in rows without a pivot."""
     row_active[i] = row_active[k] = 0
     n, is_single = _merge_columns(columns, row_sizes, i, k, union), i == k
     a, b, c, d = R[i, j], R[i, l], R[k, j], R[k, l]
