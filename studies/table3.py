@@ -190,8 +190,8 @@ def short_tables(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, str]:
 
 def study_of(geometry: Geometry | None = None) -> Study:
     """Return the study, with the geometry that is assumed or with another."""
-    made = partial(make_short, geometry=geometry)
-    return Study("table3", __doc__, made, short_findings, short_figures, short_tables, medians=True)
+    make_rows = partial(make_short, geometry=geometry)
+    return Study("table3", __doc__, make_rows, short_findings, short_figures, short_tables, medians=True)
 
 
 UNEQUAL = 1.2  # times of the same run, largest over least, beyond which they are no result

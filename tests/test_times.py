@@ -19,8 +19,7 @@ def test_a_start_at_the_time_of_a_clock_costs_no_digits(method):
     options = {"method": method, "rtol": tolerance, "atol": tolerance}
     far = solve_dae(SWING, (1.7e9, 1.7e9 + 2.0), *START, dense_output=True, **options)
     near = swing(2.0, **options)
-    starts = (far, 1.7e9), (near, 0.0)
-    error_far, error_near = (worst(each.q, pendulum_state(each.t - t0)[0]) for each, t0 in starts)
+    error_far, error_near = (worst(each.q, pendulum_state(each.t - t0)[0]) for each, t0 in ((far, 1.7e9), (near, 0.0)))
     assert far.t[-1] == 1.7e9 + 2.0
     assert all((np.diff(each.t) == each.h).all() for each in (far, near))  # a step is the difference of two times
     assert error_far < 2.0 * error_near + 0.2 * tolerance

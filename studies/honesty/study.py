@@ -56,6 +56,7 @@ OF_FORCES = (  # run under sharp forces, too: all presets but the paper's, which
 OWN_SUFFIX = " (twoloop)"
 DEFAULT = f"{GIVEN}{OWN_SUFFIX}"
 WITH_CODE: dict[str, dict[str, Any]] = {"": {}, "compiled": {"compiled": True}, "not compiled": {"compiled": False}}
+OWN_ONLY = (traps.MANY, traps.STOPS, traps.INERTIA, traps.CERTIFICATE, traps.SIGNAL, traps.CALLS)
 QUICK_OWN, QUICK_SCIPY = (GIVEN, "DOP853", "BDF"), ("DOP853",)
 OWN_OF = {  # groups of many runs, which fewer methods make
     **dict.fromkeys((traps.SINGULAR, traps.FOLD), (GIVEN, "auto, not compiled", "DOP853")),
@@ -122,14 +123,7 @@ def solvers_of(quick: bool, group: str = traps.MISTAKE) -> dict[str, Call]:
         others = {name: solve for name, solve in others.items() if name in (IDA, IDA_C)}
     methods = QUICK_OWN if quick else OWN_OF.get(group, OWN)
     made: dict[str, Call] = {f"{name}{OWN_SUFFIX}": partial(own, name) for name in methods}
-    if group in (
-        traps.MANY,
-        traps.STOPS,
-        traps.INERTIA,
-        traps.CERTIFICATE,
-        traps.SIGNAL,
-        traps.CALLS,
-    ):  # of twoloop alone
+    if group in OWN_ONLY:
         return made
     made |= {name: partial(other, solve, False) for name, solve in others.items()}
     if group not in (traps.INPUT, traps.LINKAGE, traps.SINGULAR, traps.FOLD):  # which a largest step does not help

@@ -68,7 +68,8 @@ N_LINKAGES, LINKAGE_END = 100, 5.0  # of each kind; s
 SIZES, ENDS = tuple(range(1, 7)), (5.0, 10.0, 20.0)  # of A02 in both sets of coordinates; s
 TOLERANCES = tuple(10.0 ** (-0.5 * k) for k in range(12, 23))  # of A02: 1e-6 to 1e-11
 N_STARTS, FOLD_TOLERANCES = 5, tuple(10.0**-k for k in range(4, 12))  # of each linkage that folds
-MORE_STARTS, MORE_SIZES, LONGER = {"rhombus": 95}, (10, 20, 40), 100.0  # starts (else 20); sizes of A02; time limit, s
+MORE_STARTS = dict.fromkeys(FOLDS, 20) | {"rhombus": 95}
+MORE_SIZES, LONGER = (10, 20, 40), 100.0  # of A02; s, the time limit of its runs
 N_BALLS, N_LONG, N_SIGNALS, N_CALLS, LASTING = 4, 2, 4, 5, 3.0  # draws of each kind; s
 STOP_TOLERANCES, INERTIA_TOLERANCES, CERTIFICATE_TOLERANCES = (1e-5, 1e-8, 1e-11), (1e-8, 1e-10), (1e-4, 1e-6, 1e-8)
 LEAST_IMPACTS, NUDGE = 15, 1e-9  # of balls; m/s, by which velocities are changed to see how errors grow
@@ -203,7 +204,7 @@ def singular_positions() -> Iterator[Trap]:
 def folds(group: str = FOLD) -> Iterator[Trap]:
     """Yield linkages that fold on the way, from N_STARTS random starts or from MANY more, at FOLD_TOLERANCES."""
     for place, name in enumerate(FOLDS):
-        starts = range(N_STARTS) if group == FOLD else range(N_STARTS, N_STARTS + MORE_STARTS.get(name, 20))
+        starts = range(N_STARTS) if group == FOLD else range(N_STARTS, N_STARTS + MORE_STARTS[name])
         for k, tolerance in product(starts, FOLD_TOLERANCES):
             known = moved(name, (SEED, place, k)) | {"mechanism": f"{name}, start {k}, {tolerance:g}", "error": None}
             yield Trap("linkage that folds", **known, tolerance=tolerance, singular=True, group=group)
@@ -374,10 +375,10 @@ def changing_torques(n: int) -> Iterator[Trap]:
     still = turned(lambda t, q, v: 0.0)
     for (kind, (name, change)), python, k in product(enumerate(CHANGES.items()), (True, False), range(n)):
         changing = torque(change, float if python else np.positive, np.random.default_rng([SEED, kind, python, k]))
-        solve = lambda system, *run, f=changing, **options: solve_dae(turned(f).system, *run, **options)  # noqa: E731
-        given = still.system, still.q0, still.v0, LASTING
+        solve = lambda _, *start, f=changing, **options: solve_dae(turned(f).system, *start, **options)  # noqa: E731
+        run = still.system, still.q0, still.v0, LASTING
         place = f"pendulum, {'Python' if python else 'traced'}, draw {k}"
-        yield Trap(f"torque that changes: {name}", place, *given, solve=solve, group=CALLS)
+        yield Trap(f"torque that changes: {name}", place, *run, solve=solve, group=CALLS)
 
 
 def of_motion(name: str, problem: Problem, positions: Callable[[float], Array]) -> Trap:

@@ -111,9 +111,10 @@ def test_runs_depend_neither_on_threads_nor_on_their_order_nor_on_one_another(ma
 
 def test_times_at_which_states_are_wanted_change_no_step(made):
     system, q, v, parameters, options, runs = made
-    ends = ensemble(system, SPAN, q[:20], v[:20], parameters=parameters[:20], **{**options, "t_eval": None})
+    settings = {**options, "t_eval": None, "parameters": parameters[:20]}
+    ends, far = (ensemble(system, (t0, t0 + 2.0), q[:20], v[:20], **settings) for t0 in (0.0, 1.7e9))
     assert ends.t.tolist() == [0.0, 2.0] and (ends.q[:, :, 0] == q[:20]).all()
-    assert (ends.n_steps[1:] == runs.n_steps[1:20]).all()
+    assert (ends.n_steps[1:] == runs.n_steps[1:20]).all() and np.abs(far.q - ends.q)[1:, :, 1].max() < 50.0 * TOLERANCE
     assert np.abs(ends.q[1:, :, 1] - runs.q[1:20, :, -1]).max() < 1e-13
 
 

@@ -38,8 +38,8 @@ def test_the_rule_of_outcomes():
     quiet = {"status": "REACHED_END", "error": 5e-5, "warned": "", "message": ""}
     redundant = {"warned": "the constraints of 'x' have rank 5 of 6"}
     more = {"warned": f"{redundant['warned']} / beware"}, {"message": f"Done; {honesty.UNCONTROLLED}."}
-    known = ({}, SILENT), ({"error": 1e-9}, RIGHT), (redundant, SILENT), *((each, SAID) for each in more)
-    for change, expected in known:
+    cases = ({}, SILENT), ({"error": 1e-9}, RIGHT), (redundant, SILENT), *((each, SAID) for each in more)
+    for change, expected in cases:
         assert honesty.outcome(quiet | change, SOUND, True) == expected
     assert honesty.outcome(quiet | {"error": None}, SOUND, False) == SILENT
     assert honesty.outcome(quiet, replace(SOUND, sensitivity=10.0), True) == RIGHT

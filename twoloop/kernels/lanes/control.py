@@ -10,6 +10,7 @@ import numpy as np
 from twoloop.kernels.control.loop_state import N_PAST, N_RULE
 from twoloop.kernels.control.step_size import record_accepted_step, step_size_ratio
 from twoloop.kernels.data.common import compiled, inlined, kernel, merged
+from twoloop.kernels.evaluation.constraints import representable_step
 from twoloop.kernels.lanes import layout as at
 from twoloop.kernels.lanes.layout import (
     LANES,
@@ -79,6 +80,15 @@ def begin_control(options, control, work, n, state, a, start):
                 work[at.PAST * LANES + N_PAST * k + i] = 0.0
 
 
+@merged
+def _round_steps(work, control):
+    """Round H, the step sizes, to differences of two times: else states and times of long runs drift apart."""
+    for k in range(LANES):
+        h, t = work[at.H * LANES + k], work[at.T * LANES + k]
+        if h != control[at.T1] - t:
+            work[at.H * LANES + k] = representable_step(t, h)
+
+
 @compiled
 def choose_steps(work, control, status, n_steps):
     """Store the size of the next step, at most control[GAP] (s), in H and X; set ACTIVE to 1 in lanes with a run.
@@ -103,8 +113,10 @@ def choose_steps(work, control, status, n_steps):
             else:
                 last_step_failed = work[at.H_LIMIT * LANES + k] < np.inf and work[at.LIMIT_AGE * LANES + k] == 0.0
                 remove_run(work, status, k, at.NO_VALUES if last_step_failed else at.MANY_REJECTIONS)
-        work[at.X * LANES + k] = work[at.H * LANES + k]
         work[at.ACTIVE * LANES + k] = work[at.RUNNING * LANES + k]
+    _round_steps(work, control)
+    for k in range(LANES):
+        work[at.X * LANES + k] = work[at.H * LANES + k]
 
 
 @compiled
@@ -232,7 +244,9 @@ def step_by_series(code, settings, control, options, work, status, n_steps, with
             remove_run(work, status, k, at.MANY_STEPS)
     code.compute_series(order, control, work)
     code.choose_sizes(order, control, work)
-    for k in range(LANES):  # store the number of evaluations of the defect within the step
+    _round_steps(work, control)
+    for k in range(LANES):  # store X, and the number of evaluations of the defect within the step
+        work[at.X * LANES + k] = work[at.H * LANES + k] / work[at.UNIT * LANES + k]
         if work[at.ACTIVE * LANES + k] == 1.0 and work[at.H * LANES + k] > control[at.GAP]:
             work[at.EVALUATED * LANES + k] = np.ceil(work[at.H * LANES + k] / control[at.GAP]) - 1.0
     code.check_defect_within(order, control, work)

@@ -331,6 +331,8 @@ def _take_steps(f, w, options, data, tolerances, control, clock, goal, state, n_
         h, reaches_goal = size_off_grid(control, t, h_wanted, goal - t, False)
         if reaches_goal:
             h = goal - t
+        elif h == 0.0:  # the size rounds to zero
+            break
         result, _, factor = _solve_collocation(f, w, options, data, tolerances, t, h, state)
         if result == NOT_COMPUTED:
             break
