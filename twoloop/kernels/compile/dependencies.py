@@ -2,8 +2,8 @@
 
 When numba compiles a function, it freezes values, that is, makes them part of the machine code: globals, closure
 variables, defaults, attributes of modules, items of tuples, and compiled functions that it calls (helpers). `Digest`
-hashes these values, `frozen_values` lists where they are stored, and `FunctionCopier` copies a function with other
-helpers.
+hashes these values, as a key of the machine code on disk. `frozen_values` lists where they are stored, to detect later
+changes. `FunctionCopier` copies a function with other helpers, for example helpers that check array indices.
 """
 
 from __future__ import annotations
@@ -25,38 +25,39 @@ from numba.core.types import Type
 
 from twoloop.kernels.compile.linking import Dispatcher, jitable_templates, options_of
 
-# functions of these libraries are hashed by their names only; with other versions of numba or numpy, no file is valid
+# functions of these libraries are hashed by name only: code cached with other versions of numba or numpy is not used
 LIBRARIES = {*sys.stdlib_module_names, "numpy", "numba", "scipy"}
 
-# the names that a code object loads are cached for at most this number of code objects. Runs create new functions with
-# the same code object; without the cache, reading its instructions would take most of the time of tracing
+# capacity (number of code objects) of the cache of `_loaded_names`: runs create many functions from one code object,
+# and without the cache most of the time of tracing callbacks would be spent on reading its bytecode
 MAX_CODES = 2000
 DIGEST_VERSION = 2  # part of all digests: increase it to make all machine code cached by earlier versions invalid
 
 
 def digest_of(text: str, *sources: str | types.ModuleType) -> str:
-    """Return one digest of a text and of the contents of source files, given by their paths or as modules."""
+    """Return one hash of a text and of the contents of source files, each given by its path or its module."""
     digest = hashlib.sha256(text.encode())
     for source in sources:
         digest.update(Path(source if isinstance(source, str) else str(source.__file__)).read_bytes())
     return digest.hexdigest()
 
 
-_DIGEST_TEXTS: WeakKeyDictionary[Dispatcher, str] = WeakKeyDictionary()  # texts hashed in place of callbacks
+# by compiled callback: the text that `Digest` hashes in place of the callback's code, see `register_digest`
+_DIGEST_TEXTS: WeakKeyDictionary[Dispatcher, str] = WeakKeyDictionary()
 
 
 def register_digest(callback: Dispatcher, text: str) -> None:
-    """Register a text for a callback: digests hash this text, not the callback's code and the values that it uses."""
+    """Let digests hash `text` in place of a callback's code and the values that it uses."""
     _DIGEST_TEXTS[callback] = text
 
 
 def closure_values(function: Any) -> list[Any]:
-    """Return the values of the closure variables of a function."""
+    """Return the values of the closure variables of a Python function."""
     return [cell.cell_contents for cell in function.__closure__ or ()]
 
 
 class NotDigestible(Exception):
-    """Error: a value cannot be hashed, because it may change without a change of its digest."""
+    """Error: a value has no digest, because it may change in a way that no digest would show; callers do not cache."""
 
 
 class Digest:
@@ -65,11 +66,12 @@ class Digest:
     def __init__(self) -> None:
         self.hash = hashlib.sha256(f"{DIGEST_VERSION} {np.__version__}".encode())
         self.names: set[str] = set()  # if a value is a module, only its attributes with these names are hashed
-        self.positions: dict[tuple[int, str], int] = {}  # serial number of each value added so far, by its id and name
-        self.helpers: list[Any] = []  # compiled helpers added so far; a helper comes after the helpers that it calls
+        # serial numbers of helpers (by id and "") and of attributes of modules (by id of the module and name)
+        self.positions: dict[tuple[int, str], int] = {}
+        self.helpers: list[Any] = []  # compiled helpers hashed so far; a helper comes after the helpers that it calls
 
     def add(self, value: Any) -> None:
-        """Add a value to the hash; raise NotDigestible if the value may change later without changing the hash."""
+        """Add a value to the hash; raise NotDigestible if the value may change later while its hash stays the same."""
         self.hash.update(f"<{type(value).__qualname__}>".encode())
         if value is None or isinstance(value, (bool, int, float, complex, str, bytes, np.generic, Type)):
             self.hash.update(repr(value).encode())
@@ -106,7 +108,6 @@ class Digest:
         self.names = outer
 
     def _add_helper(self, helper: Any) -> None:
-        """Add a compiled helper, with all values that it uses."""
         if helper in _DIGEST_TEXTS:
             self.add(_DIGEST_TEXTS[helper])
         elif self._is_new(helper):
@@ -125,7 +126,7 @@ class Digest:
                     self.add([name, vars(module)[name]])
 
     def _add_name(self, value: Any) -> None:
-        """Add a function or type of a library by its name; raise NotDigestible for any other value."""
+        """Hash a library's function or type by name, a named-tuple type by its fields; else raise NotDigestible."""
         if isinstance(value, type) and hasattr(value, "_fields"):
             self.hash.update(f"{value.__qualname__}{value._fields}".encode())
             return
@@ -137,7 +138,7 @@ class Digest:
         self.hash.update(f"{module}.{name}".encode())
 
     def _is_new(self, value: Any, name: str = "") -> bool:
-        """If a value is new, register it and return True; else hash the number that it got at its first occurrence."""
+        """If a value is new, give it a serial number and return True; else hash its serial number and return False."""
         key = (id(value), name)
         if key in self.positions:
             self.hash.update(f"<again {self.positions[key]}>".encode())
@@ -147,7 +148,7 @@ class Digest:
 
 
 def names_of_code(code: types.CodeType) -> set[str]:
-    """Return the names of all globals and attributes in a code object and in functions nested in it."""
+    """Return the names of the globals and attributes that a code object and functions nested in it use."""
     inner_codes = [constant for constant in code.co_consts if isinstance(constant, types.CodeType)]
     return set(code.co_names).union(*map(names_of_code, inner_codes))
 
@@ -159,7 +160,10 @@ def globals_of(function: Any) -> dict[str, Any]:
 
 
 def reachable_names(function: Any, seen: set[int] | None = None) -> set[str]:
-    """Return the names of globals and attributes in a function and its helpers; skip functions with ids in `seen`."""
+    """Return the names of the globals and attributes that a function and its helpers use.
+
+    `seen`: ids of the functions searched before, which are skipped.
+    """
     seen = set() if seen is None else seen
     seen.add(id(function))
     names = names_of_code(function.__code__)
@@ -172,28 +176,27 @@ def reachable_names(function: Any, seen: set[int] | None = None) -> set[str]:
 
 
 def is_library(module: str) -> bool:
-    """Return True if a module belongs to LIBRARIES."""
+    """Return True if a module, given by name, belongs to one of LIBRARIES."""
     return module.partition(".")[0] in LIBRARIES
 
 
 def is_twoloop(module: str) -> bool:
-    """Return True if a module is part of twoloop or generated by it: its globals are constant, its indices valid."""
+    """Return True if a module (given by name) is part of twoloop or generated by it: its globals never change."""
     return f"{module}.".startswith(("twoloop.", "twoloop_equations_"))
 
 
-# Python's bytecode instructions that load a global (LOAD_NAME in the body of a class), and that load an attribute
-LOADS_GLOBAL = ("LOAD_GLOBAL", "LOAD_NAME")
-LOADS_ATTRIBUTE = ("LOAD_ATTR", "LOAD_METHOD")
+LOADS_GLOBAL = ("LOAD_GLOBAL", "LOAD_NAME")  # bytecode instructions that load a global (LOAD_NAME: in a class body)
+LOADS_ATTRIBUTE = ("LOAD_ATTR", "LOAD_METHOD")  # bytecode instructions that load an attribute
 FROZEN_VALUES = "__as_compiled__"  # attribute of a compiled callback that stores the result of `frozen_values`
 # bytecode instructions that may stand between loading a variable and loading its attribute
 NO_EFFECT = ("EXTENDED_ARG", "CACHE", "NOP", "PUSH_NULL")
 
 
 class FrozenValue(NamedTuple):
-    """Describe a value that a function uses, and where it is stored.
+    """Value that is part of a function's machine code, and the place where it is stored.
 
-    holder : closure cell or dict that contains the value; another value may be stored there later. None: the value is a
-        default or an item of a tuple, which cannot be replaced.
+    holder : closure cell or dict that contains the value; the user may store another value there later. None: the value
+        is a default or an item of a tuple, which cannot be replaced.
     key : key of the value if the holder is a dict.
     name : name of the value in messages, such as "package.module.K" or "TABLES[0]".
     """
@@ -205,7 +208,7 @@ class FrozenValue(NamedTuple):
 
 
 class _LoadedName(NamedTuple):
-    """Name of a global (if `free`, of a closure variable) that code loads; `attributes`: ("b", "c") for name.b.c."""
+    """Variable that code loads: closure variable if `free`, else global; `attributes`: ("b", "c") for `name.b.c`."""
 
     free: bool
     name: str
@@ -213,10 +216,10 @@ class _LoadedName(NamedTuple):
 
 
 def frozen_values(compiled: Any, function: Any = None) -> list[tuple[FrozenValue, bytes | None]]:
-    """Return the values that are part of the machine code of a compiled function.
+    """Return the values that are part of the machine code of a compiled function; for arrays, also their bytes.
 
-    Each value comes with its bytes if it is an array, else with None. The first call, just after the compilation,
-    stores the list in an attribute of `compiled`. `function`: the original function, if a copy of it was compiled.
+    The first call, just after the compilation, stores the list in an attribute of `compiled`. A comparison with the
+    list later shows that a value has changed. `function`: the original function, if a copy of it was compiled.
     """
     values: list[tuple[FrozenValue, bytes | None]] | None = getattr(compiled, FROZEN_VALUES, None)
     if values is None:
@@ -230,9 +233,9 @@ def _array_bytes(value: Any) -> bytes | None:
 
 
 def frozen_locations(function: Any, seen: set[int] | None = None) -> Iterator[FrozenValue]:
-    """Yield the values in a function and its helpers that become part of machine code, such as numbers and arrays.
+    """Yield the values that a function and its helpers use and that become part of machine code, such as arrays.
 
-    Omit values in twoloop's functions, which never change, but search their helpers. `seen`: ids of values to skip.
+    Omit values in twoloop's functions, which never change, but search their helpers. `seen`: ids searched before.
     """
     seen = set() if seen is None else seen
     if id(function) in seen:
@@ -249,7 +252,7 @@ def frozen_locations(function: Any, seen: set[int] | None = None) -> Iterator[Fr
 
 
 def python_function(value: Any) -> FunctionType | None:
-    """Return the Python function of a helper compiled by `njit`, `vectorize` etc.; None if `value` is no helper."""
+    """Return the Python function that `njit`, `vectorize` etc. have compiled to `value`; None if it is not compiled."""
     if isinstance(value, Dispatcher):
         return value.py_func  # type: ignore[no-any-return]
     if isinstance(value, FunctionType):
@@ -271,7 +274,7 @@ def _is_frozen(value: Any) -> bool:
 
 
 def _value_and_items(location: FrozenValue, seen: set[int]) -> Iterator[FrozenValue]:
-    """Yield a value. If it is a tuple whose id is not in `seen`, also yield its arrays, functions and tuples."""
+    """Yield a value and, if it is a tuple, its items that are arrays, functions or tuples; `seen`: see above."""
     yield location
     if not isinstance(location.value, tuple) or id(location.value) in seen:
         return
@@ -284,7 +287,7 @@ def _value_and_items(location: FrozenValue, seen: set[int]) -> Iterator[FrozenVa
 
 
 def _direct_locations(function: FunctionType) -> Iterator[FrozenValue]:
-    """Yield the defaults, globals and closure variables of a function, and the attributes of modules that it uses."""
+    """Yield the defaults, globals, closure variables and attributes of modules that a function itself uses."""
     code, namespace = function.__code__, function.__globals__
     last_arguments = code.co_varnames[: code.co_argcount][::-1]
     for name, value in zip(last_arguments, (function.__defaults__ or ())[::-1], strict=False):
@@ -304,7 +307,7 @@ def _locations_in_module(location: FrozenValue, attributes: tuple[str, ...], nam
     """Yield the attributes of a user's module (`location`), and of modules within this module, that a function uses.
 
     `attributes`: names loaded one after another, such as ("inner", "K") for `module.inner.K`. If it is empty, the
-    module is assigned to a variable or passed to a helper; then yield all attributes whose names are in `names`.
+    function assigns the module to a variable or passes it on: then yield all attributes whose names are in `names`.
     """
     if not isinstance(location.value, ModuleType) or is_library(location.value.__name__):
         return
@@ -335,7 +338,7 @@ def _loaded_names(code: CodeType) -> tuple[_LoadedName, ...]:
 
 
 class FunctionCopier:
-    """Copy functions; in copies, replace the compiled helpers in globals, defaults and closure variables.
+    """Copy functions so that the copies call other helpers, for example helpers that check array indices.
 
     `wrap(copy, original)` returns the replacement of the helper `original`; `copy` is a copy of its Python function.
     The helpers that `copy` uses are replaced only after `wrap` has returned.
@@ -343,10 +346,13 @@ class FunctionCopier:
 
     def __init__(self, wrap: Callable[[types.FunctionType, Any], Any]):
         self.wrap = wrap
-        self.copies: dict[Any, Any] = {}
+        self.copies: dict[Any, Any] = {}  # replacements, by id of the original
 
     def replacement_of(self, value: Any, names: frozenset[str] = frozenset()) -> Any:
-        """Return a copy of a helper, tuple (items copied) or module (attributes `names` copied); else `value`."""
+        """Return the replacement of a value: of a helper, of a tuple with helpers, or of a user's module.
+
+        In a copied module, only attributes with these `names` are replaced. Other values are returned unchanged.
+        """
         if self.is_copied(value):
             if id(value) not in self.copies:
                 self._add_copy(value)
@@ -358,11 +364,10 @@ class FunctionCopier:
         return value
 
     def is_copied(self, value: Any) -> bool:
-        """Return True if copied functions get a replacement of this value; a derived class may choose other values."""
+        """Return True if a value is a compiled helper, which is replaced; a derived class may replace other values."""
         return isinstance(value, Dispatcher) or bool(jitable_templates(value))
 
     def _copy_module(self, module: types.ModuleType, names: frozenset[str]) -> types.ModuleType:
-        """Return a copy of a module in which the attributes listed in `names` are replaced."""
         key = (id(module), names)
         if key not in self.copies:
             self.copies[key] = copy = types.ModuleType(module.__name__)
@@ -373,12 +378,12 @@ class FunctionCopier:
         return self.copies[key]  # type: ignore[no-any-return]
 
     def copy_of(self, function: Any) -> Any:
-        """Return the replacement of a Python function: what `wrap` returns for a copy of it."""
+        """Return what `wrap` returns for a copy of a Python function."""
         self._add_copy(function)
         return self.copies[id(function)]
 
     def _add_copy(self, helper: Any) -> None:
-        """Store the replacement of a helper or Python function in `self.copies`, by the id of the original."""
+        """Store the replacement of a helper or Python function in `self.copies`."""
         function = getattr(helper, "py_func", helper)
         used_names, names = names_of_code(function.__code__), frozenset(reachable_names(function))
         cells = tuple(types.CellType() for _ in function.__closure__ or ())

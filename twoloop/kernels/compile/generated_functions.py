@@ -1,8 +1,8 @@
-"""Compile the LLVM code that twoloop generates for one mechanism, without numba; cache machine code on disk.
+"""Compile the LLVM code that twoloop generates for one mechanism, without numba; cache the machine code on disk.
 
 Numba would add about a thousand lines of code to each function, and take ten milliseconds for each line of its source.
-Generated code consists only of arithmetic on numbers in memory, already in a good order, so that LLVM can emit machine
-code after few optimisations.
+Generated code consists only of arithmetic on numbers in memory. It needs few of LLVM's optimisations, because its
+operations are already in a good order.
 """
 
 from collections import defaultdict
@@ -15,14 +15,16 @@ from numba.core.registry import cpu_target
 
 from twoloop.kernels.compile.caches import UNWRITABLE_CACHE_WARNING, BoundedCache, CodeFiles, sources_folder, warn_once
 
-# True if this version of llvmlite can run single optimisation passes of LLVM; False if it can only run all passes
+# True if this version of llvmlite can run selected optimisation passes of LLVM; False if it can only run all of them
 HAS_SINGLE_PASSES = hasattr(binding.ModulePassManager, "add_reassociate_pass")
 
 
 class GeneratedFunctions:
     """Machine code of generated functions, in memory as long as this object exists.
 
-    `content`: object code from `object_code`. The field `addresses` has the address of each function, by its name.
+    names : names of the functions.
+    content : their object code, as `object_code` returns it.
+    addresses : address of each function in memory, by its name.
     """
 
     def __init__(self, names: list[str], content: bytes):
@@ -34,23 +36,24 @@ class GeneratedFunctions:
 
 
 class DeferredFunctions:
-    """Functions that are generated only when one of their addresses is first read: many runs do not use them."""
+    """Functions that `generate` compiles only when one of their addresses is first read: many runs do not use them."""
 
     def __init__(self, generate: Callable[[], GeneratedFunctions]):
         self._generate = generate
 
     @cached_property
     def functions(self) -> GeneratedFunctions:
-        """Functions, generated at the first access; they stay in memory as long as this object."""
+        """The functions, compiled at the first access; they stay in memory as long as this object exists."""
         return self._generate()
 
     @property
     def addresses(self) -> dict[str, int]:
-        """Address of each function, by its name."""
+        """Address of each function in memory, by its name."""
         return self.functions.addresses
 
 
-_FUNCTIONS_IN_MEMORY: dict[str, BoundedCache] = defaultdict(BoundedCache)  # functions by kind, then by key
+# GeneratedFunctions in memory: by `kind`, then by `key`, both as in `generated_functions`
+_FUNCTIONS_IN_MEMORY: dict[str, BoundedCache] = defaultdict(BoundedCache)
 
 
 def generated_functions(
@@ -58,7 +61,7 @@ def generated_functions(
 ) -> GeneratedFunctions:
     """Return the functions of one LLVM module from memory or from the disk; if they are not there, compile them.
 
-    kind : name of the cache, which contains the newest MAX_ON_DISK modules on disk.
+    kind : name of the cache on disk, which keeps the MAX_ON_DISK modules compiled last.
     stamp : digest of the Python code that generates the functions; a file with another stamp is out of date.
     key : digest of the expressions that the functions compute.
     write : function that returns the names of the functions, and the text of the LLVM module to compile.
@@ -69,7 +72,7 @@ def generated_functions(
     files, disk_key = _code_files(kind, stamp), _disk_key(key)
     try:
         names_and_content = files.load(disk_key)
-    except Exception:  # an incompatible file from another installation; compilation will overwrite it
+    except Exception:  # the file is incompatible, from another installation: compile, and overwrite it below
         names_and_content = None
     if names_and_content is None:
         names, text = write()
@@ -84,17 +87,16 @@ def generated_functions(
 
 
 def are_cached(kind: str, stamp: str, key: str) -> bool:
-    """Return True if `generated_functions` need not compile: the functions are in memory or on disk."""
+    """Return True if `generated_functions`, with these arguments, would find the functions in memory or on disk."""
     return key in _FUNCTIONS_IN_MEMORY[kind] or _code_files(kind, stamp).has_file(_disk_key(key))
 
 
 def _code_files(kind: str, stamp: str) -> CodeFiles:
-    """Return the files on disk of one kind of functions; for `kind` and `stamp` see `generated_functions`."""
     return CodeFiles(sources_folder(), kind, (binding.llvm_version_info, stamp), True)
 
 
 def _disk_key(key: str) -> Any:
-    """Return the key of a file: numba's description of the processor, then `key` of `generated_functions`."""
+    """Return the key of a file of machine code: a description of the processor, then `key`, which names the code."""
     return (*cpu_target.target_context.codegen().magic_tuple(), key)
 
 
@@ -117,7 +119,7 @@ def _shared_target_machine() -> Any:
 
 @cache
 def _two_pass_manager() -> tuple[Any, Any]:
-    """Return a pass manager of LLVM with two optimisation passes, and its pass builder.
+    """Return a manager that runs two of LLVM's optimisation passes, and its pass builder.
 
     These passes make the code of small mechanisms a tenth faster; all other passes together gain no further speed. The
     result is cached, because LLVM leaks 300 kB for each pass that is created.
@@ -129,7 +131,7 @@ def _two_pass_manager() -> tuple[Any, Any]:
 
 
 def _all_pass_manager() -> tuple[Any, Any]:
-    """Return a pass manager with all passes of LLVM, and its pass builder, for one module; needed by llvmlite 0.44."""
+    """Return a new manager that runs all passes of LLVM, and its pass builder; llvmlite 0.44 has no other manager."""
     builder = _pass_builder()
     return builder.getModulePassManager(), builder
 
@@ -144,8 +146,8 @@ def _target_triple() -> str:
 
 
 def _new_target_machine() -> Any:
-    """Return a new LLVM target machine for the processor for which numba compiles; engines cannot share one."""
-    options: dict[str, Any] = {"opt": 1}  # level 2 compiles a quarter longer; code without branches gains no speed
+    """Return a new LLVM target machine for the processor for which numba compiles; each engine needs its own."""
+    options: dict[str, Any] = {"opt": 1}  # level 2 would compile a quarter longer, and not make generated code faster
     cpu_target.target_context.codegen()._customize_tm_options(options)
     return binding.Target.from_triple(_target_triple()).create_target_machine(**options)
 

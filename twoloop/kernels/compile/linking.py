@@ -9,8 +9,8 @@ kernel requests it: most loops in kernels are short, so that tests of their leng
 
 While a kernel is compiled, `kernel_rules` replaces some functions of numba. One replacement leaves out the code for
 negative indices, which kernels do not use: this code would hide from LLVM that elements are adjacent. It has no effect
-on other functions compiled at that time. The other replacements yield the same machine code in less time: they cache
-results that numba would compute again and again.
+on functions of the user. The other replacements make compilation faster: they cache results that numba would compute
+again and again, or do the same work with less code.
 
 Modules that need private parts of numba to generate code import these parts from this module.
 """
@@ -44,7 +44,7 @@ __all__ = ["Dispatcher", "add_signature", "cgutils", "discard_compiled_code", "j
 
 
 def jitable_templates(function: Any) -> list[Any]:
-    """Return numba's implementations (templates) of a function decorated by `register_jitable`, else an empty list.
+    """Return the templates by which numba compiles a function decorated by `register_jitable`; [] for other functions.
 
     Numba compiles such a function again for each function that calls it.
     """
@@ -58,19 +58,19 @@ def jitable_templates(function: Any) -> list[Any]:
         return []
     closures = [getattr(getattr(each, "_overload_func", None), "__closure__", None) for each in templates]
     is_own = [any(cell.cell_contents is function for cell in source or ()) for source in closures]
-    return templates if all(is_own) else []  # []: numba would compile another function in place of this one
+    return templates if all(is_own) else []  # not all: calls of this function are compiled from another one (overload)
 
 
 def add_signature(function: Dispatcher, signature: Any) -> None:
-    """Let a compiled function accept also the argument types of `signature`, without compiling it again.
+    """Let numba call a compiled function also with the argument types of `signature`, without compiling it again.
 
-    These arguments must have the same layout in memory as those for which the function was compiled.
+    The new types must have the same layout in memory as the types for which the function was compiled.
     """
     dispatcher: Any = function
     (compiled,) = dispatcher.overloads.values()
     dispatcher._insert([each._code for each in signature.args], compiled.entry_point, False)
     dispatcher.overloads[signature.args] = compiled._replace(signature=signature)
-    description = copy(compiled.fndesc)  # tells numba the types of arguments when compiled code calls the function
+    description = copy(compiled.fndesc)  # numba reads the argument types from it to compile calls of the function
     description.argtypes = signature.args
     dispatcher.targetctx.insert_user_function(compiled.entry_point, description, [compiled.library])
 
@@ -81,7 +81,7 @@ def options_of(helper: Any) -> dict[str, Any]:
 
 
 def discard_compiled_code(function: Any) -> None:
-    """Discard the compiled code of a function decorated by `register_jitable`, so that numba compiles it anew."""
+    """Discard numba's compiled code of a function decorated by `register_jitable`; its next use compiles it again."""
     for template in jitable_templates(function):
         template._impl_cache.clear()
 
@@ -90,7 +90,7 @@ _numba_fix_index = arrayobj.fix_integer_index
 
 
 def _emit_index(context: Any, builder: Any, kind: Any, index: Any, size: Any) -> Any:
-    """Emit code that computes an array index; in kernels and helpers, omit the code for negative indices."""
+    """Emit code that computes an array index; in kernels and helpers, without the code for negative indices."""
     if kind.signed and isinstance(context.active_code_library, _HelperLibrary | _KernelLibrary):
         return context.cast(builder, index, kind, types.intp)
     return _numba_fix_index(context, builder, kind, index, size)
@@ -102,9 +102,9 @@ _numba_basic_indexing: Any = arrayobj.basic_indexing
 def _emit_element_address(
     context: Any, builder: Any, kind: Any, array: Any, index_types: Any, indices: Any, **options: Any
 ) -> Any:
-    """Emit code for the address of one element of a contiguous array; it is shorter than numba's general code.
+    """Emit code for the address of one element of a contiguous array, which is shorter than numba's general code.
 
-    In all other cases (slices, arrays that are not contiguous, bounds checks) call numba's own function.
+    For slices, other arrays or checks of bounds, call numba's own function, which emits the general code.
     """
     is_element = len(indices) == kind.ndim and all(isinstance(each, types.Integer) for each in index_types)
     if kind.layout != "C" or not is_element or options.get("boundscheck"):
@@ -117,21 +117,21 @@ def _emit_element_address(
 
 _numba_call_type: Any = BaseFunction.get_call_type
 _call_signatures: dict[Any, tuple[Any, Any]] = {}
-# (options of numba, their text), by the id of the options; no other object gets this id while they are stored here
+# by id of an object with options of numba: the object, stored so that no other object gets its id, and its text
 _option_texts: dict[int, tuple[Any, str]] = {}
 
 
 def _options_text(options: Any) -> str:
-    """Return the options of a compilation as text, from a cache; the text is part of keys of other caches."""
+    """Return numba's options of a compilation as text, from a cache; `_cached_call_type` uses the text in its keys."""
     if id(options) not in _option_texts:
         _option_texts[id(options)] = options, repr(options and options._values)
     return _option_texts[id(options)][1]
 
 
 def _cached_call_type(self: Any, context: Any, args: Any, kws: Any) -> Any:
-    """Return the signature that a call of a function or operator of numba gets, from a cache by argument types.
+    """Return numba's signature of a call (of the function or operator `self`, with arguments of these types).
 
-    Without this cache, numba would try all implementations for each call, which takes a tenth of the compile time.
+    It is read from a cache: numba would try all implementations for each call, a tenth of the time of compilation.
     """
     key = self, args, tuple(kws.items()), _options_text(ConfigStack.top_or_none())
     if key not in _call_signatures:
@@ -146,7 +146,7 @@ _type_sizes: dict[str, int] = {}
 
 
 def _cached_type_size(self: Any, kind: Any) -> Any:
-    """Return the size (bytes) of an LLVM type, from a cache; otherwise LLVM would parse a module for each variable."""
+    """Return the size (bytes) of an LLVM type, from a cache: numba would let LLVM parse a module for each variable."""
     name = str(kind)
     if name not in _type_sizes:
         _type_sizes[name] = _numba_type_size(self, kind)
@@ -158,7 +158,7 @@ _inlined_code: dict[Any, Any] = {}
 
 
 def _cached_inlined_code(self: Any, function: Any, enable_ssa: bool = False) -> Any:
-    """Return numba's intermediate code of an inlined function, from a cache, which saves an analysis for each call."""
+    """Return numba's intermediate code of an inlined function, from a cache: numba would analyse it for each call."""
     if (function, enable_ssa) not in _inlined_code:
         _inlined_code[function, enable_ssa] = _numba_inlined_passes(self, function, enable_ssa)
     self.flags.enable_ssa = enable_ssa
@@ -167,11 +167,11 @@ def _cached_inlined_code(self: Any, function: Any, enable_ssa: bool = False) -> 
     return code
 
 
-_LEAF_TYPES = {ir.Loc, str, int, bool, type(None)}  # parts of a statement that have these types contain no variables
+_LEAF_TYPES = {ir.Loc, str, int, bool, type(None)}  # types of those parts of a statement that contain no variables
 
 
 def _variables_of_statement(self: Any, part: Any) -> list[Any]:
-    """Return the variables in a statement or part of it; faster than numba's own function, with the same result."""
+    """Return the variables in a statement, or part of it, of numba's intermediate code, as numba does, but faster."""
     if isinstance(part, ir.Var):
         return [part]
     if isinstance(part, ir.Inst):
@@ -190,9 +190,9 @@ _numba_load_registries: Any = CPUContext.load_additional_registries
 
 
 def _load_registries_once(self: Any) -> None:
-    """Install numba's implementations of Python and NumPy functions in a copy of a compilation context.
+    """Install numba's implementations of Python and NumPy functions in `self`, a copy of a compilation context.
 
-    Import their registries only for the first copy; numba would do so for each. All copies share these registries.
+    Copies share the lists (registries) of implementations. Import these for the first copy only; numba would for each.
     """
     if self._registries:
         for registry in list(self._registries):
@@ -201,7 +201,7 @@ def _load_registries_once(self: Any) -> None:
         _numba_load_registries(self)
 
 
-_LOCK_EVENTS = ("numba:llvm_lock", "numba:compiler_lock")  # kinds of events that numba reports when it takes a lock
+_LOCK_EVENTS = ("numba:llvm_lock", "numba:compiler_lock")  # kinds of events by which numba reports that it takes a lock
 
 
 def _skip_lock_events(report: Any) -> Any:
@@ -209,7 +209,7 @@ def _skip_lock_events(report: Any) -> Any:
     return lambda kind, *args, **named: None if kind in _LOCK_EVENTS else report(kind, *args, **named)
 
 
-# functions of numba that `kernel_rules` replaces: owner (class or module), name of the attribute, replacement
+# functions of numba that `kernel_rules` replaces: class or module, name of its attribute, replacement
 _RULES: list[tuple[Any, str, Callable[..., Any]]] = [
     (Function, "get_call_type", _cached_call_type),
     (arrayobj, "fix_integer_index", _emit_index),
@@ -221,13 +221,13 @@ _RULES: list[tuple[Any, str, Callable[..., Any]]] = [
     (event, "start_event", _skip_lock_events(event.start_event)),
     (event, "end_event", _skip_lock_events(event.end_event)),
 ]
-_MISSING_ATTRIBUTE = object()  # original value of an attribute that the owner inherits, and does not define itself
-_depth = [0]  # number of contexts `kernel_rules` that are active; they may be nested
+_MISSING_ATTRIBUTE = object()  # stands for the original of an inherited attribute, which is restored by deletion
+_depth = [0]  # number of active contexts `kernel_rules`, which may be nested: the outermost one replaces and restores
 
 
 @contextmanager
 def kernel_rules() -> Iterator[None]:
-    """Return a context for compiling a kernel, in which the replacements in `_RULES` are active in numba."""
+    """Return a context in which numba uses the replacements in `_RULES`; kernels are compiled in it."""
     if _depth[0] == 0:
         originals = [vars(owner).get(name, _MISSING_ATTRIBUTE) for owner, name, _ in _RULES]
         for owner, name, rule in _RULES:
@@ -246,7 +246,7 @@ def kernel_rules() -> Iterator[None]:
 
 
 class _CodegenWithoutEnvironment:
-    """Numba's code generator, but without environments (Python data of loaded functions): helpers are not loaded."""
+    """Numba's code generator for helpers: it stores no environments, the Python data of functions that are loaded."""
 
     def __init__(self, codegen: Any):
         self._codegen = codegen
@@ -255,11 +255,11 @@ class _CodegenWithoutEnvironment:
         return getattr(self._codegen, name)
 
     def set_env(self, name: str, environment: Any) -> None:
-        """Do nothing."""
+        """Do nothing: a helper is never loaded, and has no environment."""
 
 
 class _HelperLibrary(CPUCodeLibrary):
-    """LLVM's intermediate code of a helper, which becomes part of its callers."""
+    """LLVM's intermediate code of a helper; it becomes part of the machine code of callers."""
 
     @property
     def codegen(self) -> Any:
@@ -272,7 +272,7 @@ class _HelperLibrary(CPUCodeLibrary):
         pass  # the code is optimised as part of the callers
 
     def _get_module_for_linking(self) -> Any:
-        """Return the module for linking, not a copy as numba's own method does: nothing else uses this module."""
+        """Return the module to link into callers; numba would return a copy, but nothing else uses this module."""
         if self._shared_module is None:
             self._ensure_finalized()
             for function in self._final_module.functions:
@@ -303,8 +303,8 @@ class _VectorizedLibrary(_KernelLibrary):
     vectorized = True
 
 
-# passes of numba that would find nothing to do in kernels: they treat nested functions, expressions of whole arrays,
-# inlined overloads, and code that is not allowed in compiled functions
+# passes of numba that are skipped: they treat nested functions, expressions of whole arrays, inlined overloads, and
+# code that is not allowed in compiled functions, none of which kernels contain
 _SKIPPED_PASSES = {InlineClosureLikes, NopythonRewrites, InlineOverloads, IRLegalization}
 
 
@@ -336,7 +336,6 @@ class KernelCompiler(_Compiler):
         super().__init__(typing_context, target_context, library, *others)
 
     def compile_extra(self, function: Any) -> Any:
-        """Compile a kernel while `kernel_rules` are active."""
         with kernel_rules():
             return super().compile_extra(function)
 
@@ -349,20 +348,20 @@ class VectorizingCompiler(KernelCompiler):
 
 @cache
 def entry_point(function: Dispatcher) -> Any:
-    """Return a function that calls a compiled function without checking the types of arguments.
+    """Return the function by which Python calls the machine code of a compiled function without checks of types.
 
-    Checking them would take as long as two steps of a small mechanism. Arguments of wrong types crash the process.
+    These checks would take as long as two steps of a small mechanism. Arguments of wrong types crash the process.
     """
     compiled: Any = next(iter(function.overloads.values()))
     return compiled.entry_point
 
 
-# addresses of machine code by compiled function; each function has one signature
+# address of machine code, by compiled function: one address, because each function is compiled for one signature
 _ADDRESSES: WeakKeyDictionary[Dispatcher, int] = WeakKeyDictionary()
 
 
 def machine_code_address(function: Dispatcher, signature: Any) -> int:
-    """Return the address of a compiled function's machine code; callers must use numba's calling convention."""
+    """Return the address of a compiled function's machine code, for calls by numba's internal calling convention."""
     if function not in _ADDRESSES:
         compiled: Any = function.overloads.get(signature.args) or function.get_compile_result(signature)
         _ADDRESSES[function] = int(compiled.library.get_pointer_to_function(compiled.fndesc.llvm_func_name))

@@ -1,4 +1,4 @@
-"""Define types of structures of arrays and functions, which kernels receive as one pointer to a table of addresses.
+"""Define structures of arrays and functions that compiled functions receive as one pointer, to a table of addresses.
 
 Numba would pass a named tuple of forty arrays as about three hundred arguments, and write them to memory at every call
 that LLVM does not inline. A structure of the type `Reference` also has named fields, but is a single argument.
@@ -22,24 +22,24 @@ from twoloop.kernels.compile.caches import BoundedCache
 from twoloop.kernels.compile.linking import machine_code_address
 
 NO_ELEMENTS: Mapping[str, Mapping[str, int]] = {}
-_REFERENCES: dict[str, Any] = {}  # all objects `Reference`, by name
+_REFERENCES: dict[str, Any] = {}  # all `Reference` types, by name
 
 
 def _reference_named(name: str) -> Any:
-    """Return the `Reference` of a given name; pickle calls this function, so that it never creates a second one."""
+    """Return the existing `Reference` with this name; pickle calls this function, and so does not create a second."""
     return _REFERENCES[name]
 
 
 class Reference(types.Type):
-    """Type of a structure of arrays and functions, which is passed as a pointer to a table.
+    """Type, for numba, of a structure of arrays and functions, which is passed as a pointer to a table.
 
     The table contains the address and shape of each array, and the address of each function. A function is compiled by
     numba, or generated as LLVM code (see generated_functions.py). A generated function receives arrays as addresses of
     their first elements, without shapes, and reports no errors.
 
     name : unique name of the type.
-    arrays : type of each array, by field; all arrays are contiguous, with one or two dimensions.
-    elements : for some arrays, by field: {name: index}. In kernels, `structure.name` is the element at this index.
+    arrays : type of each array, by name of its field; all arrays are contiguous, with one or two dimensions.
+    elements : by field of an array: {name: index}. In compiled code, `structure.name` is the element at this index.
     """
 
     def __init__(
@@ -49,13 +49,13 @@ class Reference(types.Type):
         _REFERENCES[name] = self
         self.arrays = dict(arrays)
         self.dtypes = {field: as_dtype(kind.dtype) for field, kind in self.arrays.items()}
-        # by name of an element: the field of the array that contains the element, and the element's index in this array
+        # by name of an array element: the field of its array, and its index in this array
         self.elements = {element: (array, i) for array, named in elements.items() for element, i in named.items()}
         self.functions: dict[str, Signature] = {}
-        self.llvm_functions: set[str] = set()  # keys of `functions` that name generated functions
-        self.offsets: dict[str, int] = {}
-        self.n_words = 0
-        self._addresses: Any = BoundedCache()  # addresses of machine code, by tuple of functions
+        self.llvm_functions: set[str] = set()  # fields in `functions` whose functions are generated as LLVM code
+        self.offsets: dict[str, int] = {}  # by field: index in the table of its address (of an array: and shape)
+        self.n_words = 0  # length of the table so far
+        self._addresses: Any = BoundedCache()  # addresses of machine code, by the tuple of all functions of a structure
         for field, kind in self.arrays.items():
             self.offsets[field] = self.n_words
             self.n_words += 1 + kind.ndim
@@ -64,7 +64,7 @@ class Reference(types.Type):
         return _reference_named, (self.name,)
 
     def __repr__(self) -> str:
-        """Return the name and a digest of the fields, for the keys of machine code on disk that uses this type."""
+        """Return the name and a digest of the fields: part of the key of cached machine code that uses this type."""
         fields: list[Any] = [(field, str(kind)) for field, kind in self.arrays.items()]
         fields += self.elements.items()
         fields += [
@@ -73,16 +73,16 @@ class Reference(types.Type):
         return f"{self.name}-{hashlib.sha256(repr(fields).encode()).hexdigest()[:16]}"
 
     def add_function(self, field: str, signature: Signature) -> None:
-        """Add a field for a function compiled by numba; arguments of the function may have this type."""
+        """Add a field for a function compiled by numba; its arguments may also be structures of this type."""
         self.functions[field] = signature
         self.offsets[field] = self.n_words
         self.n_words += 1
         _define_call(self, field, signature)
 
     def add_llvm_functions(self, signatures: Mapping[str, Signature]) -> None:
-        """Add fields for generated functions; `signatures`: signature of each function, by field.
+        """Add fields for generated functions, given their signatures by field.
 
-        A structure may lack such a function (address 0): a kernel must compare the address with 0 before a call.
+        A structure may lack such a function; its address is then 0. Compiled code must check this before a call.
         """
         for field, signature in signatures.items():
             self.functions[field] = signature
@@ -97,10 +97,10 @@ class Reference(types.Type):
         return str(_llvm_type(signature.return_type)), [str(_llvm_type(kind)) for kind in signature.args]
 
     def table(self, values: Any) -> Any:
-        """Return the table (int64) of the structure whose arrays and functions are attributes of the object `values`.
+        """Return the table (int64) of a structure; `values`: object with an attribute for each field.
 
-        An attribute is a function compiled by numba (None: missing), or the address of a generated function (0:
-        missing). The object `values` must exist as long as the table is used.
+        The attribute of a function is the function compiled by numba (None: missing), or the address of a generated
+        function (0: missing). The object `values` must exist as long as the table is used.
         """
         words: list[int] = []
         for field, kind in self.arrays.items():
@@ -128,10 +128,10 @@ register_model(Reference)(models.OpaqueModel)
 
 @unbox(Reference)
 def _unbox(typ: Any, obj: Any, c: Any) -> NativeValue:
-    """Emit code that converts a Python argument of a `Reference` type to a pointer.
+    """Emit code that converts the Python object that stands for a structure, an argument, to a pointer to its table.
 
-    The argument is the address of a table, or an object with this address as its attribute `address`. Passing the
-    address saves a tenth of a microsecond.
+    The object is the address of the table, or has this address as attribute `address`. Passing the address itself saves
+    a tenth of a microsecond.
     """
     python_type = c.builder.load(
         c.builder.gep(c.builder.bitcast(obj, obj.type.as_pointer()), [ir.Constant(ir.IntType(32), 1)])
@@ -150,7 +150,7 @@ def _unbox(typ: Any, obj: Any, c: Any) -> NativeValue:
 
 
 def _load_word(context: Any, builder: Any, pointer: Any, offset: int, kind: Any) -> Any:
-    """Emit code that loads word number `offset` (64 bits) of a table; LLVM may assume that the word never changes."""
+    """Emit code that loads entry `offset` (64 bits) of the table at `pointer`; tell LLVM that it never changes."""
     slot = builder.gep(builder.bitcast(pointer, ir.IntType(64).as_pointer()), [ir.Constant(ir.IntType(64), offset)])
     word = builder.load(builder.bitcast(slot, kind.as_pointer()))
     word.set_metadata("invariant.load", builder.module.add_metadata([]))
@@ -159,7 +159,7 @@ def _load_word(context: Any, builder: Any, pointer: Any, offset: int, kind: Any)
 
 @infer_getattr
 class _FieldTypes(AttributeTemplate):
-    """Tell numba the type of each field or element of a `Reference`."""
+    """Tell numba the type of an attribute of a structure: an array, an array element or a function."""
 
     key = Reference
 
@@ -179,7 +179,7 @@ class _FieldTypes(AttributeTemplate):
 
 
 def _element_address(context: Any, builder: Any, typ: Any, pointer: Any, field: str) -> Any:
-    """Emit code for the address of the array element that kernels access as the attribute `field`."""
+    """Emit code for the address of the array element that compiled code accesses as the attribute `field`."""
     array, index = typ.elements[field]
     item_type = context.get_data_type(typ.arrays[array].dtype)
     data = _load_word(context, builder, pointer, typ.offsets[array], item_type.as_pointer())
@@ -188,7 +188,7 @@ def _element_address(context: Any, builder: Any, typ: Any, pointer: Any, field: 
 
 @lower_setattr_generic(Reference)
 def _store_element(context: Any, builder: Any, sig: Any, args: Any, field: str) -> None:
-    """Emit code that stores a number in the array element that kernels access as the attribute `field`."""
+    """Emit code that stores a number in the array element that compiled code accesses as the attribute `field`."""
     pointer, value = args
     builder.store(value, _element_address(context, builder, sig.args[0], pointer, field))
 
@@ -198,7 +198,7 @@ def _load_array(context: Any, builder: Any, typ: Any, pointer: Any, field: str) 
     """Emit code for reading an attribute of a structure: an array element, an array, or (for a call) a function."""
     if field in typ.elements:
         return builder.load(_element_address(context, builder, typ, pointer, field))
-    if field in typ.functions:  # return the table: `lower_call` loads the address of the function from it
+    if field in typ.functions:  # the pointer to the table is enough: a call loads the address of the function from it
         return pointer
     kind, offset = typ.arrays[field], typ.offsets[field]
     item_type = context.get_data_type(kind.dtype)
@@ -217,7 +217,7 @@ def _load_array(context: Any, builder: Any, typ: Any, pointer: Any, field: str) 
     }
     model = context.data_model_manager[kind]
     array = ir.Constant(context.get_value_type(kind), ir.Undefined)
-    for name, value in fields.items():  # keeps the array in registers; numba's own function would use memory
+    for name, value in fields.items():  # so LLVM keeps the array in registers; numba's own function uses memory
         index = model.get_field_position(name)
         element = ir.Constant(array.type.elements[index], None) if value is None else value
         array = builder.insert_value(array, element, index)
@@ -225,7 +225,7 @@ def _load_array(context: Any, builder: Any, typ: Any, pointer: Any, field: str) 
 
 
 def _define_call(typ: Reference, field: str, signature: Signature) -> None:
-    """Define the code that calls the function in a field of a `Reference`, for a function compiled by numba."""
+    """Tell numba how to compile calls of a structure's function, `field`, that numba itself has compiled."""
     offset = typ.offsets[field]
 
     @lower_builtin((typ.name, field), typ, *signature.args)
@@ -239,7 +239,7 @@ def _define_call(typ: Reference, field: str, signature: Signature) -> None:
         return value
 
 
-_LLVM_TYPES = {  # LLVM types by types of numba
+_LLVM_TYPES = {  # LLVM's types of arguments and results, by numba's types
     types.float64: ir.DoubleType(),
     types.int64: ir.IntType(64),
     types.boolean: ir.IntType(1),
@@ -248,12 +248,12 @@ _LLVM_TYPES = {  # LLVM types by types of numba
 
 
 def _llvm_type(kind: Any) -> Any:
-    """Return the LLVM type of an argument or result of a generated function; an array is passed as a pointer."""
+    """Return LLVM's type of an argument or result of a generated function; for an array, the type of a pointer."""
     return _LLVM_TYPES[kind.dtype].as_pointer() if isinstance(kind, types.Array) else _LLVM_TYPES[kind]
 
 
 def _define_llvm_call(typ: Reference, field: str, signature: Signature) -> None:
-    """Define the code that calls the function in a field of a `Reference`, for a generated function."""
+    """Tell numba how to compile calls of a structure's function, `field`, that is generated as LLVM code."""
     offset = typ.offsets[field]
 
     @lower_builtin((typ.name, field), typ, *signature.args)
