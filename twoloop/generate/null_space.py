@@ -1,18 +1,17 @@
-"""Solve for accelerations with matrices of expressions: by factors L D L^T, or without dependent coordinates.
+"""Solve symbolically for accelerations: the entries of matrices are expressions, from which code is generated.
 
 The accelerations a satisfy M a + G^T lam = Q and G a = gamma; G are the independent rows of all constraints, [C_q; A].
+There are two methods:
 
-Class `DependentCoordinates` splits a into dependent and independent accelerations a_d and a_i, and G into the columns
-G_d and G_i. Then a_d = g + B a_i, with B = -G_d^-1 G_i and g = G_d^-1 gamma. With T = [B; 1], the remaining system is
-small: (T^T M T) a_i = T^T (Q - M g), where g is 0 for independent coordinates. This takes about half the operations of
-an elimination that begins with M, and M may be singular in directions that the constraints exclude.
+- `Factors` eliminates from the whole matrix [M G^T; G 0], beginning with M: this yields the factors L D L^T.
+- `DependentCoordinates` first solves G a = gamma for the dependent accelerations: a = g + T a_i, where a_i are the
+  independent accelerations. The system (T^T M T) a_i = T^T (Q - M g) remains, which is small. This takes about half
+  the operations of `Factors`, and M may be singular in directions that the constraints exclude.
 
-Pivots are chosen once. If a pivot becomes small during a run, a condition of the generated code fails, and the
-elimination that begins with M computes the accelerations.
+Pivots are chosen once. If a pivot of the second method becomes small during a run, generated code uses the first.
 
 Light bodies beside heavy bodies cause pivots of very different size, and elimination loses digits. Then one step of
-refinement restores them: it solves the system again, with the residual of the solution as the right-hand side. If
-this changes a solution too much, a condition of the generated code fails, as for small pivots.
+refinement restores them: it solves the system again, with the residual of the solution as the right-hand side.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -22,8 +21,8 @@ import numpy as np
 
 from twoloop.generate.graph import Affine, is_zero
 
-# accelerations are valid if a step of refinement changes them by at most this fraction. After the step, their relative
-# error is usually the square of this change; only if a light body loses all digits, it is as large as the change
+# accelerations are invalid if a step of refinement changes them by more than this fraction. The relative error that
+# then remains is usually the square of this change, and as large as the change only if a light body loses all digits
 LARGEST_CHANGE = 1e-7
 
 
@@ -31,20 +30,18 @@ class Block(NamedTuple):
     """Pivot block of the factorization L D L^T: one or two rows that are eliminated together, with one division."""
 
     row_indices: tuple[int, ...]
-    inverse: list[list[Affine]]  # inverse of the 1x1 or 2x2 matrix of pivots
-    # for each later row that has nonzero entries of L in the columns of the block: its index, and these entries
-    rows_below: list[tuple[int, list[Affine]]]
+    inverse: list[list[Affine]]  # inverse of the 1x1 or 2x2 block of D
+    rows_below: list[tuple[int, list[Affine]]]  # index and entries of each nonzero row of L below the block
 
 
 class Factors:
-    """Factors L D L^T of a symmetric matrix [M G^T; G 0] of expressions; the pivots are the blocks of D.
+    """Factors L D L^T of a symmetric matrix [M G^T; G 0] of expressions; M has `n` rows.
 
     blocks : blocks in the order of elimination.
-    conditions : for each row of G (index `n` and later), a pair of positive expressions: the magnitude of its pivot,
-        and the magnitude that this pivot would have if G had no other rows. If the first is less than a small fraction
-        of the second, the row nearly depends on other rows, and results are invalid.
-    mass_pivots : pivots of the rows of M (index below `n`), and of rows of G that need no condition. If M is positive
-        definite, all mass_pivots are positive, except perhaps constants.
+    conditions : for each row of G, a pair of positive expressions: the magnitude of its pivot, and the magnitude that
+        this pivot would have if G had no other rows. If the first is less than a small fraction of the second, the row
+        nearly depends on other rows, and results are invalid.
+    mass_pivots : all other pivots. If M is positive definite, those that are not constant are positive.
     """
 
     def __init__(self, matrix: dict[tuple[int, int], Affine], size: int, n: int):
@@ -74,7 +71,7 @@ class Factors:
             self.blocks.append(Block(row_indices, inverse, rows_below))
 
     def _inverse(self, pivots: list[list[Affine]], own_pivots: list[Any]) -> list[list[Affine]]:
-        """Return the inverse of a pivot block; `own_pivots`: pivots if G had only this row; None: no condition."""
+        """Return the inverse of the block `pivots`. `own_pivots`: pivots if G had no other rows; None: no condition."""
         diagonal = [None if pivot is None else pivot.as_term() for pivot in own_pivots]
         a = pivots[0][0]
         if diagonal[0] is None:
@@ -122,7 +119,7 @@ def solve(blocks: Sequence[Block], rhs: Sequence[Affine]) -> list[Affine]:
 
 
 def _collected_sum(products: Sequence[tuple[Affine, Affine]]) -> Any:
-    """Return the sum of products; products whose first factors are multiples of each other share a multiplication."""
+    """Return the sum of products with few multiplications: for example, (2 x) a + x b becomes x (2 a + b)."""
     total: Any = 0.0
     groups: dict[Any, tuple[Affine, Affine]] = {}
     for factor_a, factor_b in products:
@@ -141,8 +138,8 @@ def _collected_sum(products: Sequence[tuple[Affine, Affine]]) -> Any:
 def _pairs_without_conditions(rows: list[dict[int, Affine]], n: int) -> list[tuple[int, int]]:
     """Return pairs (coordinate, row of G) that are eliminated first: their pivots need no condition and no division.
 
-    Such a coordinate has only two entries in [M G^T; G 0], one in M and one in G, both constant. So the row of
-    G in the pair is independent of all other rows.
+    The row of the coordinate in [M G^T; G 0] has only two entries, one in M and one in G^T, both constant. So the row
+    of G in the pair is independent of the other rows of G.
     """
     pairs: dict[int, int] = {}  # keys: rows of G; values: coordinates
     for i, row in enumerate(rows[:n]):
@@ -155,8 +152,8 @@ def _order_rows(rows: list[dict[int, Affine]], n: int, pairs: Sequence[tuple[int
     """Return the order of elimination of the rows that are not in `pairs`, as tuples of one or two row indices.
 
     The row with the fewest neighbours comes first (minimum degree); neighbours of a row are the columns of its nonzero
-    entries. Two rows with the same neighbours form one tuple. A row of G (index n and later) comes after the rows of M
-    of its coordinates. In a tie, the row with the shortest chain of divisions comes first, so that operations overlap.
+    entries. Two rows with the same neighbours form one tuple. A row of G (index `n` and later) is eliminated after the
+    coordinates in which it has nonzero entries. In a tie, the row with the shortest chain of divisions comes first.
     """
     neighbours = [set(row) - {i} for i, row in enumerate(rows)]
     waiting_for = [{j for j in neighbours[i] if j < n} if i >= n else set() for i in range(len(rows))]
@@ -181,19 +178,19 @@ def _order_rows(rows: list[dict[int, Affine]], n: int, pairs: Sequence[tuple[int
 
 
 def _eliminate(neighbours: list[set[int]], rows: Sequence[int]) -> set[int]:
-    """Eliminate `rows` from the graph of nonzero entries: connect all their neighbours, and return these."""
+    """Update the graph of nonzero entries for an elimination of `rows`: connect their neighbours; return these."""
     new_neighbours = set().union(*(neighbours[i] for i in rows)) - set(rows)
     for j in new_neighbours:
         neighbours[j] = (neighbours[j] | new_neighbours) - {*rows, j}
     return new_neighbours
 
 
-PivotBlocks = Sequence[tuple[tuple[int, ...], tuple[int, ...]]]  # rows and columns of each pivot block (one or two)
-Terms = dict[int, Affine]  # nonzero entries of a row of a matrix, by column
+PivotBlocks = Sequence[tuple[tuple[int, ...], tuple[int, ...]]]  # per block: indices of its one or two rows and columns
+Terms = dict[int, Affine]  # nonzero entries of a row of a matrix; keys: column indices
 
-# below this limit of the squares of the following numbers, accelerations are invalid: pivot / norm of the entries that
-# it divides; pivot / norm of its column; in a block of two columns, sine of the angle between them. A number 10^-k
-# costs up to 3 k digits of accelerations. The choice of pivots has stricter limits, see linalg/dependent_columns.py
+# a pivot is too small, and accelerations are invalid, if the square of one of these ratios is below this limit: pivot
+# over norm of the entries that it divides; pivot over norm of its column; for a block of two rows, sine of the angle
+# between its columns. A ratio 10^-k costs up to 3 k digits. linalg/dependent_columns.py chooses pivots more strictly
 MIN_PIVOT_SQUARE = 0.03**2
 
 
@@ -202,18 +199,18 @@ class ReductionFailed(Exception):
 
 
 class DependentCoordinates:
-    """Solution a = g + T a_i of G a = gamma: all accelerations a, given those of independent coordinates, a_i.
+    """Solution a = g + T a_i of G a = gamma: all accelerations a, given the independent ones, a_i.
 
-    rows : the matrix G of all constraints, of full rank.
+    rows : the matrix G; its rows are independent.
     blocks : rows and columns of the pivots, in the order of elimination. The columns are the dependent coordinates.
-    max_added : largest number of operations that may be added to the graph.
+    max_added : largest number of operations that the elimination may record.
     Fields:
     independent : indices of the independent coordinates.
-    T : the matrix T: for each row, its nonzero entries; keys: indices of independent coordinates.
-    g : the vector g of length n_q; 0 for independent coordinates.
+    T : rows of the matrix T, as dictionaries of nonzero entries; keys: indices of independent coordinates.
+    g : the vector g (n_q,); 0 for independent coordinates.
     conditions : pairs of expressions. If the first is not larger than the second, a pivot is too small.
 
-    Raise ReductionFailed if a pivot is always zero, or if the elimination takes more than `max_added` operations.
+    Raise ReductionFailed if a pivot is always zero, or if more than `max_added` operations are necessary.
     """
 
     def __init__(self, rows: Sequence[Sequence[Affine]], gamma: Sequence[Affine], blocks: PivotBlocks, max_added: int):
@@ -237,7 +234,7 @@ class DependentCoordinates:
                 self._substitute(j, self._rows[i])
 
     def _eliminate(self, rows: tuple[int, ...], columns: tuple[int, ...]) -> None:
-        """Solve the equations `rows` of G a = gamma for the entries `columns` of a; insert these in other equations."""
+        """Solve the equations with indices `rows` in G a = gamma for a[columns]; insert these in later equations."""
         self.check_length()
         block = [[self._rows[i].get(j, self._zero) for j in columns] for i in rows]
         pivot, inverse = self._inverse(block)
@@ -262,7 +259,7 @@ class DependentCoordinates:
             self._add_conditions(block, columns, pivot, solved)
 
     def check_length(self, n_following: int = 0) -> None:
-        """Raise ReductionFailed if operations added so far, and `n_following` further ones, exceed `max_added`."""
+        """Raise ReductionFailed if `max_added` operations are not enough for those so far and `n_following` more."""
         if len(self._graph.operations) + n_following > self._max_operations:
             raise ReductionFailed
 
@@ -286,11 +283,7 @@ class DependentCoordinates:
     def _add_conditions(
         self, block: list[list[Affine]], columns: tuple[int, ...], pivot: Affine, solved: list[Terms]
     ) -> None:
-        """Append conditions that hold if a pivot is not small relative to entries that it divides, and to its column.
-
-        `pivot`: determinant of `block`. In a block of two rows, the second condition is that its columns are not nearly
-        parallel. Squares are compared, because pivots may be negative. `solved`: rows after division by the pivot.
-        """
+        """Append conditions that fail if `pivot`, the determinant of `block`, is too small (see MIN_PIVOT_SQUARE)."""
         entries = [entry for row in solved for j, entry in row.items() if j < self._n]
         total = _add_products(self._zero, [(entry, entry) for entry in entries])
         if total.terms:
@@ -304,7 +297,7 @@ class DependentCoordinates:
             self.conditions.append((pivot * pivot, (a * b).times(MIN_PIVOT_SQUARE)))
 
     def _substitute(self, j: int, row: Terms) -> None:
-        """Store row j of T and entry j of g for a dependent coordinate j; `row`: equation that is solved for a_j."""
+        """Store T[j] and g[j] for a dependent coordinate j; a[j] = row[n_q] - sum of row[k] a[k] over k < n_q."""
         self.check_length()
         rhs, entries = row.get(self._n, self._zero), dict[int, Affine]()
         for k, entry in row.items():
@@ -318,9 +311,9 @@ class DependentCoordinates:
 def solve_reduced_system(
     mass: Any, force: Sequence[Affine], coordinates: DependentCoordinates
 ) -> tuple[list[Affine], list[tuple[Affine, Affine]]]:
-    """Return the accelerations (n_q,), and conditions under which the reduced mass matrix T^T M T is not singular.
+    """Return the accelerations a (n_q,), given M (`mass`), Q (`force`) and the solution a = g + T a_i of constraints.
 
-    A condition is a pair of expressions, the first of which must be larger. `mass`, `force`: M and Q.
+    Also return conditions under which T^T M T is not singular: pairs of expressions, the first of which is larger.
     """
     n, T, g, independent = len(mass), coordinates.T, coordinates.g, coordinates.independent
     zero = Affine(mass[0, 0].graph, 0.0, {})
@@ -342,13 +335,13 @@ def solve_reduced_system(
 
 
 def _pivot_conditions(matrix: dict[tuple[int, int], Affine], factors: Factors) -> Iterator[tuple[Affine, Affine]]:
-    """Yield pairs, of which the first must be larger: a pivot of T^T M T (`matrix`); a fraction of a diagonal entry."""
+    """Yield conditions: each pivot of T^T M T (`matrix`) must exceed a small fraction of the diagonal entry."""
     pivots = iter(factors.mass_pivots)
     for row_indices, _, _ in factors.blocks:
         first_pivot: Affine | None = None
         for i in row_indices:
             pivot = next(pivots)
-            # for the second row of a block, `pivot` is the determinant: so the limit is multiplied by the first pivot
+            # the second pivot of a block is its determinant: so the diagonal entry is multiplied by the first pivot
             scale = matrix[i, i] if first_pivot is None else first_pivot * matrix[i, i]
             first_pivot = pivot
             if pivot.terms:
@@ -374,14 +367,15 @@ def solve_refined(
     r: Sequence[Affine],
     c: Sequence[Affine],
 ) -> tuple[list[Affine], list[tuple[Affine, Affine]]]:
-    """Return the solution a, lam (of independent rows) of M a + G^T lam = r, G a = c, and conditions of its validity.
+    """Return the solution (a, lam) of M a + G^T lam = r, G a = c, and conditions; improve it if `choice.is_refined`.
 
-    If `choice.is_refined`, one step of refinement improves the solution. Then there is one condition, a pair of
-    expressions: if the first is not larger, refinement has changed a too much. The change is compared with a and, since
-    a is small near equilibrium, with the accelerations of all masses by r alone.
+    `choice`: PivotChoice, which lists the independent rows; only these have a multiplier in lam. `mass`: M; `rows`: G.
+    `solve`: function that solves linear systems with the matrix [M + S, G^T; G 0], where S is 0, or terms that make
+    M definite (see PivotChoice).
 
-    `solve`: function that solves a linear system with the matrix [M + sum of s g^T g, G^T; G 0], where s and g are
-    `choice.scales` and rows of G (see PivotChoice). `mass`: M. `rows`, `c`: rows of G and their right-hand sides.
+    There is one condition if one step of refinement has improved the solution, otherwise none. It is a pair of
+    expressions: if the first is not larger, the step has changed a too much. The change is compared with a and, as
+    a is small near equilibrium, with the accelerations that the forces r would cause without constraints.
     """
 
     def solve_once(r: Sequence[Affine], c: Mapping[int, Affine] | Sequence[Affine]) -> list[Affine]:

@@ -1,8 +1,7 @@
 """Compute with numbers that record how they depend on parameters, so that one trace serves all parameter values.
 
-A `Parameter` is a float: callbacks compute with it as with any other float, and results are Parameters, too. Its
-current value decides whether terms cancel, and whether expressions are equal. So parameters must have generic values
-(random numbers), for which no terms cancel by chance.
+A `Parameter` is a float: callbacks compute with it as with any other float, and results are Parameters, too. Its value
+during the trace is a random number, so that no terms cancel that would not cancel for other values.
 """
 
 import math
@@ -17,14 +16,14 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-# product of powers of atoms (see `ParameterTape`) as pairs: index of an atom, exponent; the empty tuple is the number 1
+# product of powers as pairs (index of the base in ParameterTape.atoms, exponent); the empty tuple is the number 1
 Powers = tuple[tuple[int, float], ...]
 
-MAX_TERMS = 200  # callbacks with sums of more terms of parameters are refused: these take long to compare
+MAX_TERMS = 200  # a callback is not traced if it adds up more terms with parameters: long sums are slow to compare
 _as_float = float.__pos__  # converts a Parameter to a float; float(x) raises an exception while callbacks are traced
-# the sum of two terms with opposite signs counts as zero if it is at most this fraction of one of them
+# two terms cancel if their sum is at most this fraction of the second term
 CANCELLATION_LIMIT = 8.0 * 2.0**-52
-NUMBER_TYPES = (int, float, np.number)  # types of numbers; a Parameter is a float
+NUMBER_TYPES = (int, float, np.number)  # a Parameter is a float
 _UNARY_FUNCTIONS = ("sin", "cos", "tan", "sqrt", "exp", "log", "arctan", "sinh", "cosh", "tanh", "absolute")
 FUNCTIONS = {name: getattr(np, name) for name in (*_UNARY_FUNCTIONS, "hypot", "power")}
 OPERATORS: dict[str, Callable[..., Any]] = {  # keys: names in NumPy; values: functions by Python's operators
@@ -53,11 +52,10 @@ class Refusal(BaseException):
 
 
 class SymbolicObject:
-    """Base class of Graph and ParameterTape, which record operations on symbols while a callback is traced.
+    """Base class of Graph and ParameterTape, which record the operations of a callback while it is traced.
 
-    is_tracing : whether a callback is running on symbols of this record.
-    refusal_reason : reason why the callback cannot be traced; "" if there is none so far. The reason is stored, because
-        the callback may catch the exception.
+    is_tracing : whether a callback is being traced with symbols or Parameters of this record.
+    refusal_reason : reason why the callback cannot be traced; "": none so far. Callbacks may catch the exception.
     """
 
     is_tracing, refusal_reason = False, ""
@@ -71,7 +69,7 @@ class SymbolicObject:
 
     @contextmanager
     def running_callback(self) -> Iterator[None]:
-        """Return a context manager for a call of a callback; raise Untraceable if the callback caught a Refusal."""
+        """Context manager for a call of a callback; at its end, raise Untraceable if the callback caught a Refusal."""
         self.is_tracing, self.refusal_reason = True, ""
         try:
             yield
@@ -84,16 +82,15 @@ class SymbolicObject:
 class ParameterTape(SymbolicObject):
     """Record of how numbers were computed from parameters.
 
-    A number is a constant times a product of powers of atoms. An atom is a parameter, a sum of numbers, or a function
-    of numbers. Callbacks must not branch on the current values of the numbers.
+    Each number is a constant times a product of powers of atoms: parameters, sums, or functions of such numbers.
 
-    values : current values of all parameters; random for parameters that vary, so that no terms cancel by chance.
+    values : values of all parameters during the trace; random for parameters that vary, see the module docstring.
     varying : indices of the parameters that vary; the others are constants.
     """
 
     def __init__(self, values: Sequence[float], varying: Iterable[int]):
         self.atoms: list[Any] = [None] * len(values)
-        self._merged_products: dict[tuple[Powers, Powers], Powers] = {}  # cached products; keys: the two factors
+        self._merged_products: dict[tuple[Powers, Powers], Powers] = {}  # keys: two factors; values: their product
         self._atom_indices: dict[Any, int] = {}
         self.parameters = np.empty(len(values), dtype=object)
         self.parameters[:] = [float(value) for value in values]
@@ -101,14 +98,14 @@ class ParameterTape(SymbolicObject):
             self.parameters[i] = Parameter(float(values[i]), self, 1.0, ((i, 1.0),))
 
     def atom(self, definition: Any) -> Powers:
-        """Return the atom with this definition (a sum or a function) as Powers; create the atom if it is new."""
+        """Return an atom as Powers; create it if it is new. `definition`: ("sum", terms) or (function name, arguments)."""
         if definition not in self._atom_indices:
             self._atom_indices[definition] = len(self.atoms)
             self.atoms.append(definition)
         return ((self._atom_indices[definition], 1.0),)
 
     def terms(self, number: float) -> dict[Powers, float]:
-        """Return a number as a sum of terms; keys: Powers (products of powers of atoms); values: coefficients."""
+        """Return the terms whose sum is `number`; keys: products of powers of atoms; values: their coefficients."""
         if type(number) is not Parameter:
             return {(): number} if number else {}
         (i, exponent), *other_powers = number.powers
@@ -118,12 +115,12 @@ class ParameterTape(SymbolicObject):
         return {powers: number.scale * c for powers, c in definition[1]}
 
     def number_evaluator(self, parameters: Array) -> Callable[[float], Any]:
-        """Return a function that evaluates a float or a Parameter for these `parameters`, see `product_evaluator`."""
+        """Return a function that evaluates any float or Parameter for given `parameters`, see `product_evaluator`."""
         product = self.product_evaluator(parameters)
         return lambda number: number.scale * product(number.powers) if type(number) is Parameter else number
 
     def product_evaluator(self, parameters: Array) -> Callable[[Powers], Any]:
-        """Return a function that evaluates Powers (products of powers of atoms) for given values of all `parameters`.
+        """Return a function that evaluates Powers (products of powers of atoms) for given `parameters`.
 
         If `parameters` is (n_runs, n_p), the function returns an array (n_runs,), or one number for all runs.
         """
@@ -153,7 +150,7 @@ class ParameterTape(SymbolicObject):
         return product
 
     def evaluate(self, expressions: Sequence["Parameter"], parameters: Array) -> Array:
-        """Return the values (n_runs, len(expressions)) of expressions for the parameters `parameters` (n_runs, n_p)."""
+        """Return the values (n_runs, len(expressions)) of expressions, for `parameters` of shape (n_runs, n_p)."""
         product = self.product_evaluator(parameters)
         rows = {powers: k for k, powers in enumerate(dict.fromkeys(parameter.powers for parameter in expressions))}
         products = np.empty((len(rows), len(parameters)))
@@ -166,7 +163,7 @@ class ParameterTape(SymbolicObject):
 
 
 class Parameter(float):
-    """Float that records how it depends on parameters: as the constant `scale` times `powers`, a product of atoms."""
+    """Float that records how it depends on parameters: scale * powers, a number times a product of powers of atoms."""
 
     __slots__ = ("powers", "scale", "tape")
     tape: ParameterTape
@@ -188,7 +185,7 @@ class Parameter(float):
         return elementwise(lambda *arguments: apply_function(name, *arguments), inputs, out)
 
     def _refuse_decision(self, reason: str = "it branches on its parameters, or rounds them") -> None:
-        """Refuse an operation that reveals the current value, unless a module of `twoloop.generate` does it."""
+        """Refuse an operation that reveals this number's value to a callback; modules of `twoloop.generate` may."""
         caller = sys._getframe(2).f_globals.get("__name__", "")
         if self.tape.is_tracing and not caller.startswith(__name__.rpartition(".")[0]):
             self.tape.refuse(reason)
@@ -276,9 +273,9 @@ def _tape_of(*numbers: float) -> ParameterTape:
 
 
 def apply_function(name: str, *arguments: Any) -> Any:
-    """Return the value of a function of NumPy or `math`, by its name; a Parameter if an argument is a Parameter."""
+    """Call a function of NumPy or `math` by its name; the result is a Parameter if an argument is a Parameter."""
     name = NUMPY_NAMES.get(name, name)
-    if any(not issubclass(type(x), NUMBER_TYPES) for x in arguments):  # for symbols, which have their own operators
+    if any(not issubclass(type(x), NUMBER_TYPES) for x in arguments):  # symbols have their own operators
         return OPERATORS[name](*arguments)
     numbers = [x if type(x) is Parameter else float(x) for x in arguments]
     if not any(type(x) is Parameter for x in numbers):
@@ -291,7 +288,7 @@ def apply_function(name: str, *arguments: Any) -> Any:
 def _record_function(name: str, *numbers: float) -> Parameter:
     tape = _tape_of(*numbers)
     arguments = tuple((x.powers, x.scale) if isinstance(x, Parameter) else ((), x) for x in numbers)
-    with np.errstate(all="ignore"):  # at the random value, the function may be undefined
+    with np.errstate(all="ignore"):  # at the random values of the arguments, the function may be undefined
         value = float(FUNCTIONS[name](*map(float, numbers)))
     return Parameter(value, tape, 1.0, tape.atom((name, arguments)))
 
@@ -330,12 +327,12 @@ for _symbol, _name in {"add": "add", "sub": "subtract", "mul": "multiply", "true
     setattr(Parameter, f"__{_symbol}__", _binary_operator(_name, False))
     setattr(Parameter, f"__r{_symbol}__", _binary_operator(_name, True))
 for _name in _UNARY_FUNCTIONS:
-    # for an array of objects, np.sin calls the method `sin` of each object, and so on
+    # np.sin of an array of objects calls the method `sin` of each object; likewise the other functions
     setattr(Parameter, _name, lambda self, name=_name: apply_function(name, self))
 
 
 def elementwise(function: Callable[..., Any], inputs: Iterable[Any], out: Any = None) -> Any:
-    """Apply `function` to all entries of arrays without calling `__array_ufunc__` of entries; return an array."""
+    """Return the array of function(x, ...) for the entries x, ... of arrays; if `out` is given, fill out[0] with it."""
     operands = list(map(_object_array, inputs))
     results = np.frompyfunc(function, len(operands), 1)(*operands)
     if out is None:
@@ -345,7 +342,7 @@ def elementwise(function: Callable[..., Any], inputs: Iterable[Any], out: Any = 
 
 
 def _object_array(value: Any) -> Any:
-    """Return a value as an array of objects; the code uses type(), because symbols refuse isinstance()."""
+    # type() instead of isinstance(), which symbols refuse
     if issubclass(type(value), np.ndarray):
         return value.astype(object)
     array = np.empty((), dtype=object)
@@ -360,11 +357,11 @@ def number_array(values: Iterable[float]) -> Any:
 
 
 def as_number(value: Any) -> float:
-    """Return a number as a float; a Parameter is returned unchanged."""
+    """Return a number as a float, or unchanged if it is a Parameter."""
     return value if type(value) is Parameter else float(value)
 
 
 def math_function(name: str) -> Callable[[float], float]:
-    """Return the function `name` of `math`, extended to Parameters: for a Parameter, it returns a Parameter."""
+    """Return the function `name` of `math`, with an addition: for a Parameter, it returns a Parameter."""
     function = getattr(math, name)
     return lambda x: apply_function(name, x) if type(x) is Parameter else function(x)

@@ -1,10 +1,10 @@
-"""Execute programs, which compute expressions of a graph, and assign array indices to their coefficients.
+"""Programs: lists of operations of a graph of traced callbacks, and arrays of affine expressions of their results.
 
 - `Program.run` executes a program in an algebra, which defines what a value is: an array of numbers (`ArrayAlgebra`), a
   value in generated code (`llvm_code.Lowering`), or a polynomial degree (`time_dependence.DegreeAlgebra`).
 - `OperationTable` lists the operations as arrays, which compiled kernels interpret row by row.
-- Derivatives are further quantities of the graph (`graph.Derivative`). Expressions in parameters alone are coefficients
-  (`parameter_expressions`), which are computed before a program runs.
+- `Coefficients` assigns array indices to the coefficients of expressions. Coefficients may depend on parameters
+  (`parameter_expressions`); they are computed before a program runs.
 """
 
 import math
@@ -24,7 +24,7 @@ from twoloop.kernels.evaluation.operations import KIND, N_COLUMNS, NODE, RESULT
 Array = NDArray[np.float64]
 T = TypeVar("T")
 
-N_COMPARED = 5  # a traced function of the user is compared with calls of the function at this number of states
+N_COMPARED = 5  # number of states at which a user's traced function is compared with calls of the function
 TIME_SPACING = 0.37  # time (s) between successive compared states; unlikely to be the period of a force
 MAX_TRACE_DIFFERENCE = 1e-10  # a trace is wrong if it differs from a call by more (relative): this is no rounding error
 
@@ -33,10 +33,10 @@ COSTS = {op.PRODUCT: 1, op.RECIPROCAL: 4}
 
 
 class Algebra(Generic[T]):
-    """Arithmetic in which a program runs; subclasses define the type of values T, and the operations on values.
+    """Arithmetic in which a program runs; subclasses define the type T of values, and the operations on values.
 
-    functions : keys: kinds of operations with one argument; values: the functions that compute them.
-    values : keys: indices of quantities; values: their values, if defined so far.
+    functions : keys: codes of the operations with one argument, such as SINE; values: functions that compute them.
+    values : values computed so far; keys: indices of quantities in the graph.
     """
 
     functions: Mapping[int, Callable[[T], T]]
@@ -53,7 +53,7 @@ class Algebra(Generic[T]):
         raise NotImplementedError
 
     def operation(self, kind: int, first: Affine, second: Affine | None) -> T:
-        """Return the result of an operation; only products use the second argument."""
+        """Return the result of an operation; `kind`: its code, such as SINE; `second`: only for products."""
         argument = self.affine(first)
         if kind == op.PRODUCT:
             assert second is not None
@@ -72,10 +72,7 @@ class Algebra(Generic[T]):
             self.define(i, self.operation(*operation))
 
     def run_program(self, program: "Program") -> list[list[T]]:
-        """Execute a program, and return its arrays; its inputs must have been set with `define`.
-
-        The quantities in its conditions are computed, too.
-        """
+        """Compute the arrays and conditions of a program from inputs set with `define`; return the arrays."""
         self.run(program.graph, program.quantities())
         return [[self.affine(expr) for expr in exprs] for exprs in program.arrays.values()]
 
@@ -93,13 +90,13 @@ class Program:
     conditions: list[tuple[Affine, Affine]] = field(default_factory=list)
 
     def run(self, algebra: Algebra[T], inputs: Sequence[T] = ()) -> list[list[T]]:
-        """Execute the program in an algebra; return its arrays. `inputs`: values of inputs, unless already defined."""
+        """Execute the program in an algebra; return its arrays. `inputs`: values of the first inputs of the graph."""
         for quantity, value in enumerate(inputs):
             algebra.define(quantity, value)
         return algebra.run_program(self)
 
     def quantities(self, available: Container[int] = ()) -> list[int]:
-        """Return the indices of the quantities needed for arrays and conditions, except inputs and `available` ones."""
+        """Return the indices of quantities to compute for the arrays and conditions if those in `available` exist."""
         return self.graph.quantities_for(self.expressions, available)
 
     def cost(self) -> int:
@@ -124,9 +121,9 @@ class Program:
 
 
 class ArrayAlgebra(Algebra[Any]):
-    """Algebra of NumPy arrays (n_runs,): a value is an array with one number for each run, or one number for all runs.
+    """Algebra in which a value is an array (n_runs,), with one number for each run, or one number for all runs.
 
-    tape : ParameterTape of the coefficients that are Parameters.
+    tape, parameters : tape of the coefficients that are Parameters; values of its parameters, (n_runs, n_p).
     """
 
     functions: Mapping[int, Callable[[Any], Any]] = MappingProxyType(
@@ -157,17 +154,20 @@ class ArrayAlgebra(Algebra[Any]):
         return a * b
 
     def run_program(self, program: Program) -> list[list[Any]]:
-        """Execute a program, and return its arrays; values outside the domain of a function are NaN or infinite."""
+        """Execute a program, and return its arrays; outside the domain of a function, values are NaN or infinite."""
         with np.errstate(all="ignore"):
             return super().run_program(program)
 
 
 class OperationTable(NamedTuple):
-    """Operations of a program as arrays, for the kernels in kernels/evaluation/operations.py.
+    """Operations of a program as arrays, which the kernels in kernels/evaluation/operations.py execute.
 
-    Values are numbered: inputs first, then computed quantities. `rows` has a row for each operation: its kind, the
-    number of the value that it computes, and the range of the terms of each argument. `columns` and `coefficients`:
-    number of the value, and its coefficient, for each term. `constants`: constants of both arguments, by operation.
+    Nodes are numbers that the program reads or computes: inputs first, then results of operations. Arguments of an
+    operation are affine expressions of nodes.
+
+    rows : columns KIND, NODE, FIRST, SECOND, END of kernels/evaluation/operations.py; an operation per row.
+    columns, coefficients : for each term of all arguments, the index of its node, and its coefficient.
+    constants : for each operation, the constants of its two arguments; 0 if there is no second argument.
     """
 
     rows: Any
@@ -178,7 +178,7 @@ class OperationTable(NamedTuple):
 
     @classmethod
     def from_results(cls, graph: Graph, n_inputs: int, results: Mapping[int, Affine]) -> "OperationTable":
-        """Return the table that computes the expressions `results` (keys: their indices) from `n_inputs` inputs."""
+        """Return the table that computes the expressions `results` (keys: indices in the output) from the inputs."""
         needed = graph.quantities_for(results.values())
         node_of = {i: i for i in range(n_inputs)} | {i: n_inputs + k for k, i in enumerate(needed)}
         operations: list[Any] = [(*graph.operations[i], node_of[i]) for i in needed]  # type: ignore[misc]
@@ -202,7 +202,7 @@ class OperationTable(NamedTuple):
         )
 
     def as_floats(self) -> list[float]:
-        """Return the table as floats, to be stored in parameters of a model; results get the numbers 0, 1, ..."""
+        """Return the table as floats, to be stored among the parameters of a model; results are its first nodes."""
         rows = self.rows.copy()
         is_result = rows[:, KIND] == RESULT
         n_results = int(is_result.sum())
@@ -212,7 +212,7 @@ class OperationTable(NamedTuple):
         return [float(x) for part in parts for x in part]
 
     def as_arrays(self, result_indices: Sequence[int]) -> tuple[Any, Any]:
-        """Return the table as two arrays, integers and floats; `result_indices`: index of each result in the output."""
+        """Return integers and floats for a derived callback; `result_indices`: index of each result in its output."""
         rows, n = self.rows.copy(), len(result_indices)
         rows[rows[:, KIND] == RESULT, NODE] += self.n_nodes
         header = [self.n_nodes + n, len(rows), len(self.columns), n]
@@ -226,14 +226,14 @@ class OperationTable(NamedTuple):
 
 Terms = tuple[tuple[int, float], ...]  # pairs of a quantity and its coefficient
 
-LITERALS = (0.0, 1.0, -1.0)  # coefficients that are written into generated code: they need no multiplication
+LITERALS = (0.0, 1.0, -1.0)  # coefficients that are part of generated code: they need no multiplication
 LITERAL_TOLERANCE = 8.0 * 2.0**-52  # largest difference between a coefficient and the literal 1 or -1 that replaces it
 
 
 class Coefficient(float):
-    """Coefficient that generated code reads from an array; two coefficients are equal only if they are one object.
+    """Coefficient that generated code reads from an array; only the same object is equal, whatever the values.
 
-    `index`: index in the array. `varies`: whether this array is for coefficients that vary with parameters.
+    `index`: index in the array. `varies`: whether this is the array of coefficients that vary with parameters.
     """
 
     __slots__ = ("index", "varies")
@@ -257,10 +257,10 @@ class Coefficient(float):
 
 
 class Coefficients:
-    """Assignment of array indices to the coefficients of expressions, in the order of their first use.
+    """Indices, in arrays that generated code reads, of the coefficients of expressions, in the order of first use.
 
-    Equal expressions share their coefficients. `separate_varying`: whether coefficients that vary with parameters are
-    in a second array with its own indices, because their values differ between SIMD lanes.
+    Equal expressions share coefficients. If `separate_varying`, the coefficients that vary with parameters have a
+    second array with indices of its own, because their values differ between SIMD lanes.
     """
 
     def __init__(self, separate_varying: bool = False) -> None:
@@ -273,18 +273,18 @@ class Coefficients:
 
     @property
     def values(self) -> NDArray[np.float64]:
-        """Return the values of the coefficients; if `separate_varying`, only of coefficients that do not vary."""
+        """Return the values of coefficients during the trace; if `separate_varying`, only of those that do not vary."""
         return np.array(self._values, dtype=np.float64)
 
     @property
     def formulas(self) -> Any:
-        """Return coefficients as floats or Parameters; until one is added, this array object stays the same."""
+        """Return the same coefficients, as floats or Parameters; the same array object if no coefficient was added."""
         if len(self._formulas) != len(self._values):
             self._formulas = number_array(self._values)
         return self._formulas
 
     def indexed_terms(self, terms: Terms, constant: float = 0.0) -> tuple[Terms, float]:
-        """Return terms and a constant in which each number is a literal (0, 1, -1), or a Coefficient (in an array)."""
+        """Return terms and a constant, with each number replaced by a literal (0, 1, -1) or a Coefficient."""
         key = tuple((i, rounded(c)) for i, c in terms), rounded(constant)
         numbers = self._indexed_terms.get(key)
         if numbers is None:
@@ -295,14 +295,14 @@ class Coefficients:
         return numbers
 
     def indexed_expression(self, expr: Affine) -> tuple[Terms, float]:
-        """Return terms and constant of an affine expression, with literals and Coefficients as in `indexed_terms`."""
+        """Return the terms and the constant of an affine expression, as `indexed_terms` does."""
         numbers = self._indexed_expressions.get(expr.key)
         if numbers is None:
             numbers = self._indexed_expressions[expr.key] = self.indexed_terms(tuple(expr.terms.items()), expr.constant)
         return numbers
 
     def structure(self, program: Program, stored: Mapping[int, int] = MappingProxyType({})) -> Iterable[Any]:
-        """Yield everything that the code for a program depends on, except the values of coefficients.
+        """Yield all that the code for a program depends on, except values of coefficients: a key for cached code.
 
         `stored`: keys: quantities that the code loads instead of computing them; values: their indices in memory.
         """
@@ -343,7 +343,7 @@ class Coefficients:
 
 
 def nearest_literal(value: float) -> float | None:
-    """Return 0, 1 or -1 if `value` equals it up to rounding errors; None for other numbers and for Parameters."""
+    """Return 0, 1 or -1 if `value` is this number up to rounding errors; None for other numbers and for Parameters."""
     if type(value) is Parameter or not math.isfinite(value):
         return None
     nearest = float(round(value))
