@@ -1,15 +1,15 @@
 """Generate code for collocation steps whose stages are evaluated side by side, one in each SIMD lane.
 
-Fixed-point iteration evaluates all stages of an implicit Runge-Kutta step anew in each sweep. The stages do not depend
-on one another within a sweep, so that a sweep takes little longer than one evaluation. Usually the accelerations depend
-on some of the coordinates only: only these coordinates are iterated, and the others are computed from the final
-accelerations. The ends of eight steps are projected onto the constraints together, one in each lane.
+A fixed-point iteration solves for the stages of an implicit Runge-Kutta step. Each sweep (one iteration) evaluates the
+accelerations of all stages at once, one in each lane, and integrates them: this takes little longer than one
+evaluation. Usually the accelerations depend on some of the coordinates only: only these are iterated, and the others
+follow from the final accelerations. The ends of eight steps are projected onto the constraints at once, too.
 
-The functions share an array `work` (layout: kernels/data/collocation.py); kernels/steps/lobatto_step.py calls them.
+kernels/steps/lobatto_step.py calls the generated functions. They share an array `work`: see kernels/data/collocation.py
 
-The method is Lobatto IIIA with nine nodes, the first of which is the end of the previous step; its order is 16. A
-polynomial of degree 8 through values at the nodes is expanded in Legendre polynomials, whose integrals and derivatives
-at the ends are known (Hairer & Wanner, Solving ODEs II, IV.5).
+The method is Lobatto IIIA with nine nodes, the first of which is the end of the previous step; its order is 16. The
+polynomial of degree 8 through the accelerations at the nodes is expanded in Legendre polynomials, whose integrals and
+derivatives at the ends are known (Hairer & Wanner, Solving ODEs II, IV.5).
 """
 
 import hashlib
@@ -44,19 +44,18 @@ from twoloop.kernels.data.indices import ATOL, ESTIMATE, RTOL
 
 Array = NDArray[np.float64]
 Extended = NDArray[np.longdouble]
-N = 9  # number of nodes
+N = 9  # number of nodes of a step, with both ends
 
 
 class Tables(NamedTuple):
-    """Nodes 0 = c_0 < ... < c_8 = 1 of a step, and matrices for the polynomial p through nine values at the nodes.
+    """Nodes c_0 = 0, ..., c_8 = 1, and matrices (9, 8) for the polynomial p through the nine `values` at the nodes.
 
-    A matrix is used as follows: the sum over k of (value at node k) times (row k) yields the following numbers.
-    nodes, between : these are no matrices, but nodes 1 to 8, and the midpoints between neighbouring nodes.
-    velocities, positions : single and double integrals of p from 0 to each of the nodes 1 to 8.
-    values_between, velocities_between, positions_between : values of p at the midpoints, and its single and double
-        integrals from 0 to the midpoints.
-    spectrum : coefficients of p in the Legendre polynomials of degree 1 to 8 on [0, 1], each scaled to be 1 at 1.
-    begin, end : coefficients of p in powers 1 to 8 of the time since the beginning of the step, or since its end.
+    The time x runs from 0 to 1 in a step. If m is one of the matrices, `values @ m` are eight numbers, as follows.
+    nodes, between : no matrices, but the nodes c_1 to c_8, and the eight midpoints between neighbouring nodes.
+    velocities, positions : single and double integrals of p from 0 to each of c_1 to c_8.
+    values_between, velocities_between, positions_between : p at the midpoints; its single and double integrals there.
+    spectrum : coefficients of p in the Legendre polynomials of degree 1 to 8 on [0, 1]; these polynomials are 1 at 1.
+    begin, end : coefficients of p in the powers 1 to 8 of x (`begin`), and in those of x - 1 (`end`).
     """
 
     nodes: Array
@@ -73,14 +72,14 @@ class Tables(NamedTuple):
 
 @cache
 def tables() -> Tables:
-    """Return the Tables, computed in extended precision and then rounded to double precision."""
+    """Return the nodes and matrices, computed in extended precision and then rounded to double precision."""
     x = _nodes()
     between: Extended = (x[1:] + x[:-1]) / np.longdouble(2)
     values = _legendre(x)
     weights = 2 / (N * (N - 1) * values[N - 1] ** 2)
     norms = np.array([np.longdouble(2) / (2 * k + 1) for k in range(N)])
-    norms[N - 1] = np.longdouble(2) / (N - 1)  # squared norm of P_8 by quadrature at the nodes, not the exact one
-    coefficients = values[:N] * weights / norms[:, None]  # row k: coefficient of P_k in each Lagrange polynomial
+    norms[N - 1] = np.longdouble(2) / (N - 1)  # integrals are sums over the nodes: for P_8^2, 2 / 8 and not 2 / 17
+    coefficients = values[:N] * weights / norms[:, None]  # [k, j]: coefficient of P_k, Lagrange polynomial of node j
     powers = [
         np.array([[sign ** (n + k) * comb(n, k) * comb(n + k, k) for n in range(N)] for k in range(1, N)]).T
         for sign in (-1, 1)
@@ -110,59 +109,59 @@ def _legendre(z: Extended) -> Extended:
 
 
 def _integrals(coefficients: Extended, z: Extended) -> tuple[Extended, Extended, Extended]:
-    """Return three arrays with a row for each Lagrange polynomial: values at z, single and double integrals up to z.
+    """Return three arrays: values, integrals and double integrals of the Lagrange polynomials (rows) at z (columns).
 
-    `coefficients`: row k contains the coefficient of the Legendre polynomial P_k in each Lagrange polynomial. The
-    points z are on [-1, 1]. An integral is over the time, which runs on [0, 1]: from 0 to (z + 1) / 2.
+    coefficients[k, j] is the coefficient of the Legendre polynomial P_k in the Lagrange polynomial of node j. The
+    points z are on [-1, 1]; integrals are over the time (z + 1) / 2, and begin at 0.
     """
     values = _legendre(z)
-    # the integral of P_k from -1 is (P_k+1 - P_k-1) / (2 k + 1), and P_1 + 1 for k = 0; the double integrals follow
+    # the integral of P_k over z from -1 is (P_k+1 - P_k-1) / (2 k + 1), or P_1 + 1 if k = 0; the double one follows
     single = np.array([values[1] + 1, *((values[k + 1] - values[k - 1]) / (2 * k + 1) for k in range(1, N + 1))])
     double = np.array([single[1] + single[0], *((single[k + 1] - single[k - 1]) / (2 * k + 1) for k in range(1, N))])
     return coefficients.T @ values[:N], coefficients.T @ single[:N] / 2, coefficients.T @ double / 4
 
 
-MAX_OPERATIONS = 5000  # equations with more operations get no collocation code; to compile this number takes 2 s
+MAX_OPERATIONS = 5000  # equations with more operations get no collocation code: to compile it would take more than 2 s
 MIN_DIVISOR = 1e-300  # smaller divisors and allowed errors are replaced by this, so that nothing is divided by zero
-INVALID = -1.0  # result of `find_defect` if the accelerations are invalid (defects are never negative)
+INVALID = -1.0  # returned by `find_defect` instead of a defect (at least 0), if pivots are too small
 INFINITE = float("inf")
-# if fixed pivots (null_space.py) get too small in a step, this many later steps use the elimination beginning with M
+# if pivots chosen before the run get too small in a step, this many later steps use the elimination that begins with M
 STEPS_BY_MASS_FIRST = 8.0
-FIRST_DEGREE = 3.0  # degree of the polynomial that predicts the accelerations in the second step
+FIRST_DEGREE = 3.0  # degree of the polynomial that predicts the accelerations in the second step of a run
 
-# constants of the iteration. Its contraction, rho, is the ratio of the changes of velocities in two successive sweeps
+# for the fixed-point iteration. Contraction: change of velocities by a sweep / change by the sweep before
 KAPPA = 0.02  # sweeps end if the estimated error of the iteration, relative to the tolerances, is at most this
 TARGET_SWEEPS = 6.0  # step sizes are chosen for this number of sweeps; +1 if the prediction has degree 6, +2 if 7 or 8
-EXTRA_SWEEPS = 7  # a step is rejected if it takes this number of sweeps more than the target and has not converged
+EXTRA_SWEEPS = 7  # a step is rejected if it has not converged after the target number of sweeps and this number more
 MAX_CONTRACTION = 0.8  # if the contraction is at least this in the fourth sweep or later, the step is rejected
 MIN_RHO, MAX_RHO = 1e-3, 0.9  # bounds to which a measured contraction is clipped
 FAST_START, SLOW_START = 0.04, 0.3  # a guessed first step size is kept if the contraction in sweep 2 is between these
-STAGNATION_RATIO = 0.5  # sweeps also end if a change may be rounding, and is at least this fraction of the last change
+STAGNATION_RATIO = 0.5  # sweeps also end if the change may be rounding error and is at least this times the last change
 # in steps of fixed size, these replace KAPPA, MAX_ROUNDING and the largest number of sweeps
 KAPPA_OF_FIXED, ROUNDING_OF_FIXED, MAX_SWEEPS_OF_FIXED = 1e-16, 1e-9, 60.0
 SMALLEST_RATIO = 1e-30  # added to (error of the iteration) / KAPPA before its logarithm is taken: the error may be 0
 ERROR_WEIGHT = 0.5  # factor on the estimated error of a step, see `_estimate_error`
-# largest allowed product of the step size and the defect of accelerations at a midpoint between nodes, relative to the
-# tolerance of the velocity. It is larger than 1, because most of the effect of the defect averages out in a step
+# upper limit of h * defect / (tolerance of the velocity), h: step size. The defect is the difference, halfway between
+# two nodes, between the polynomial of the accelerations and the equations. Most of its effect averages out in a step
 ALLOWED_DEFECT = 16.0
 
 
 def compiles_quickly(shared: SharedCode) -> bool:
-    """Return whether the collocation code of a mechanism compiles within a few seconds, see MAX_OPERATIONS."""
+    """Return True if collocation code for these equations compiles within a few seconds."""
     return shared.equations.n_operations <= MAX_OPERATIONS
 
 
 class CollocationCode:
     """Generator of the functions for the collocation steps of one mechanism.
 
-    The methods use several emitters: `emit` writes operations on vectors of LANES numbers, `num` on single numbers,
-    `vec2` on vectors of two numbers, and `wide` on vectors whose numbers belong to successive coordinates.
+    Emitters write LLVM operations: `emit` on vectors of LANES numbers, `num` on single numbers, `vec2` on vectors of
+    two numbers, and `wide` on vectors with one number for each of several successive coordinates.
 
     shared : code of the equations; the functions for collocation steps read the same array of coefficients.
     Fields:
     iterated_coordinates : coordinates on whose positions or velocities the accelerations depend.
-    numbers : Coefficients (program.py) that the functions read from an array.
-    structure : digest of everything that the functions depend on, except values of `numbers`; it identifies them.
+    numbers : coefficients of the equations, with their indices in the array from which the functions read them.
+    structure : digest of all that determines the functions, except values of `numbers`: the key of cached functions.
     """
 
     def __init__(self, shared: SharedCode):
@@ -185,7 +184,7 @@ class CollocationCode:
 
         if self.split_functions is None:
             programs = [*self.equations.accelerations, self.equations.position_projection, self.equations.projection]
-        else:  # the digest below contains `shared.digest`, which covers the programs of split functions
+        else:  # long equations are split into several functions: `shared.digest` below covers their other programs
             programs = self.equations.accelerations[:1]
         numbers = self.numbers
         description = [[each.sizes, *numbers.structure(each)] for each in programs]
@@ -203,11 +202,11 @@ class CollocationCode:
     # methods that write the functions called by lobatto_step.py
 
     def iterate_step(self, emit: LaneEmitter, work: Value, state: Value, tolerances: Value, numbers: Value) -> Value:
-        """Write code that iterates the stages of a step; return the status that this code computes, such as CONVERGED.
+        """Write code that solves for the stages of a step; return the status that it computes, such as CONVERGED.
 
-        In this code, the program with the fewest operations computes the accelerations. Its conditions on pivots are
-        checked once, after the last sweep. If they fail, this step is iterated again with the elimination that begins
-        with M, and STEPS_BY_MASS_FIRST later steps use this elimination from the beginning. Arguments are pointers:
+        This code computes accelerations with the fewest operations, and divides by pivots that were chosen before the
+        run. After the last sweep, it checks that these pivots are large enough. If not, it solves for the stages again,
+        with the elimination that begins with M; so do STEPS_BY_MASS_FIRST later steps. The arguments are pointers:
         `work` to the memory of data/collocation.py, `state` to [q, v, a] before the step, `numbers` to coefficients.
         """
         builder, num = emit.builder, Emitter(emit.builder)
@@ -259,7 +258,7 @@ class CollocationCode:
         return self._iterate(emit, work, state, tolerances, evaluate, fallback)
 
     def _mass_first_function(self, emit: LaneEmitter, kinds: list[str]) -> str:
-        """Return the name of the function (argument types `kinds`) that iterates a step with M eliminated first."""
+        """Return the name of an LLVM function that does `iterate_step` by the elimination that begins with M only."""
         module, name = emit.builder.module, "careful_nodes"
         if not module.defines(name):
             builder = module.function(name, DOUBLE, kinds, internal=True)
@@ -274,7 +273,7 @@ class CollocationCode:
     def _evaluator(
         self, emit: LaneEmitter, work: Value, state: Value, index: int
     ) -> Callable[[list[Value]], Callable[[], Value]]:
-        """Return `evaluate` for `_iterate`: a function that writes a call of `self.equations.accelerations[index]`."""
+        """Return the argument `evaluate` of `_iterate`, which writes calls of the program `accelerations[index]`."""
         accelerations = Emitter(emit.builder).pointer(work, self.a_offset)
 
         def evaluate(inputs: list[Value]) -> Callable[[], Value]:
@@ -286,12 +285,11 @@ class CollocationCode:
         return evaluate
 
     def _accelerations(self, emit: LaneEmitter, work: Value) -> list[Value]:
-        """Write code that loads the accelerations of all coordinates at the nodes from `work`; return their values."""
         return [load_lanes(emit, work, self.a_offset + LANES * i) for i in range(self.n)]
 
     @contextmanager
     def _returning_if(self, emit: LaneEmitter, condition: Value) -> Iterator[None]:
-        """Return a context manager: code written in its block runs if `condition` is true, and must end by a return."""
+        """Return a context manager for code that runs only if `condition` is true, and that ends with a return."""
         builder = emit.builder
         return_block, next_block = builder.append_block(), builder.append_block()
         builder.branch(condition, return_block, next_block)
@@ -309,11 +307,11 @@ class CollocationCode:
         emit.builder.call_void(name, arguments)
 
     def _predict_nodes(self, emit: LaneEmitter, work: Value, state: Value, tolerances: Value) -> None:
-        """Write code that stores predicted positions and velocities at the nodes, and WEIGHTS, STRICTER, SIZE, POWERS.
+        """Write code that stores predicted positions and velocities at the nodes, with which the iteration begins.
 
-        Names in capitals are fields of `work` (data/collocation.py). WEIGHTS depend on allowed errors, atol + rtol * x:
-        x is |position| (or |velocity|) at the beginning or, if that is larger, its change in half a step. In steps of
-        fixed size, which have no error estimate, rtol = atol = 1.
+        It also stores the fields WEIGHTS, STRICTER, SIZE and POWERS of `work` (data/collocation.py). WEIGHTS are
+        reciprocals of allowed errors, atol + rtol * x: x is |position| (or |velocity|) where the step begins, or its
+        change in half a step if that is larger. If the step size is fixed, nothing is estimated, and rtol = atol = 1.
         """
         builder, num, n = emit.builder, Emitter(emit.builder), self.n
         has_fixed_size = builder.compare("fcmp oeq", num.load(tolerances, ESTIMATE), llvm_code.ZERO)
@@ -369,7 +367,7 @@ class CollocationCode:
         return factors[0] * factors[1] * (factors[2] * factors[3])
 
     def _vector_emitter(self, emit: LaneEmitter) -> tuple[LaneEmitter, list[int]]:
-        """Return an emitter for vectors of successive coordinates, and the first of each vector; they may overlap."""
+        """Return an emitter for vectors of successive coordinates, and the first coordinate of each vector."""
         lanes = min(LANES, 1 << (self.n.bit_length() - 1))
         return LaneEmitter(emit.builder, lanes), [*range(0, self.n - lanes, lanes), self.n - lanes]
 
@@ -382,12 +380,12 @@ class CollocationCode:
         evaluate: Callable[[list[Value]], Callable[[], Value]],
         fallback: Callable[[], Value],
     ) -> Value:
-        """Write code for sweeps until the stages converge or the step is rejected; return the status it computes.
+        """Write code for sweeps until the stages converge or the step is rejected; return the status that it computes.
 
-        `evaluate` gets the times and positions at the nodes, and writes code that stores the accelerations of the
-        iterated coordinates (those on which accelerations depend). `evaluate` returns a function `store_others`, which
-        writes code that stores the accelerations of the other coordinates, and returns a flag: all are valid. The
-        function `fallback` writes code for the case that they are not valid, and returns the status for this case.
+        evaluate([times, *positions at the nodes]) writes the part of a sweep that stores the accelerations of the
+        coordinates on which accelerations depend. It returns a function that is called once, for code after the last
+        sweep: this stores the accelerations of the other coordinates, and computes a flag for each lane, which is 1 if
+        pivots were large enough. If a flag is 0, the code that `fallback` writes computes the status instead.
         """
         builder, num = emit.builder, Emitter(emit.builder)
 
@@ -449,10 +447,10 @@ class CollocationCode:
 
     @contextmanager
     def _repeated(self, emit: LaneEmitter, work: Value, state: Value) -> Iterator[list[Value]]:
-        """Return a context manager; code written in its block computes accelerations from the velocities it yields.
+        """Return a context manager: the code in its block runs once in a sweep, or twice if the field REPEATS is 1.
 
-        In each sweep, this code runs with the velocities at the nodes from the last sweep. If the field REPEATS of
-        `work` is 1, it then runs again, with the integrals of the new accelerations as velocities.
+        The code computes accelerations from the velocities that the context manager yields: first, velocities of the
+        last sweep; then the integrals of the accelerations just computed, so that the iteration converges faster.
         """
         builder, num, first_offset = emit.builder, Emitter(emit.builder), integer(self.v_offset)
         before, loop, repeat, after = builder.block, *(builder.append_block() for _ in range(3))
@@ -469,25 +467,25 @@ class CollocationCode:
             v0, a0 = (num.load(num.pointer(state, i), m * self.n) for m in (1, 2))
             of_v = self._weighted_accelerations(emit, tables().velocities, a0, work, i)
             store_lanes(emit, emit.fma(h, of_v, emit.broadcast(v0)), num.pointer(work, k * LANES), self.spectrum_offset)
-        offset.add_incoming(integer(self.spectrum_offset), builder.block)  # memory not in use before `_estimate_error`
+        offset.add_incoming(integer(self.spectrum_offset), builder.block)  # where the velocities have been stored
         builder.jump(loop)
         builder.position_at_end(after)
 
     def _load_iterated(self, emit: LaneEmitter, pointer: Value) -> list[Value]:
-        """Return values at the nodes for each coordinate: loaded from `pointer` if it is iterated, else 0."""
+        """Return a vector of values at the nodes for each coordinate: loaded from `pointer` if iterated, else 0."""
         values = [emit.constant(0.0)] * self.n
         for k, i in enumerate(self.iterated_coordinates):
             values[i] = load_lanes(emit, pointer, LANES * k)
         return values
 
     def _estimate_error(self, emit: LaneEmitter, work: Value, state: Value) -> None:
-        """Write code that stores ERROR, CURVATURE, FACTOR and FACTOR_OF_ERROR (data/collocation.py) after convergence.
+        """Write code that estimates the error of a step whose stages have converged, and what size the next may have.
 
-        The error estimate ERROR extrapolates the decay of the Legendre coefficients of the accelerations. Let t be the
-        largest coefficient of degree 7 or 8, s the largest of degree 5 to 8, f the largest of degree 3 to 8. The
-        estimate is the larger of t (t / s)^1.5 and t^2 / f. In 99 % of the steps over corners and peaks of forces, the
-        error is at most 20 times the estimate. In smooth motion, the error is decades smaller than the estimate. This
-        costs few additional steps, because the step size depends only on the 12th root of the estimate.
+        It stores ERROR, CURVATURE, FACTOR and FACTOR_OF_ERROR (data/collocation.py). ERROR extrapolates the decay of
+        the Legendre coefficients of the accelerations. With m_k, the largest magnitude of the coefficients of degree k
+        to 8, it is proportional to the larger one of m_7 (m_7 / m_5)^1.5 and m_7^2 / m_3. In 99 % of the steps over
+        corners and peaks of forces, the true error is at most 20 times the estimate. In smooth motion, it is decades
+        smaller. This costs few steps, because the step size depends only on the 12th root of the estimate.
         """
         builder, num, n = emit.builder, Emitter(emit.builder), self.n
         n_sweeps, change, target, rho = (num.load(work, i) for i in (mem.SWEEPS, mem.CHANGE, mem.N_TARGET, mem.RHO))
@@ -527,8 +525,8 @@ class CollocationCode:
     def find_defect(self, emit: LaneEmitter, work: Value, state: Value, numbers: Value) -> Value:
         """Write code for the largest defect at midpoints between nodes, relative to ALLOWED_DEFECT; return its value.
 
-        The value is INVALID if accelerations are invalid. The code also stores FACTOR_OF_DEFECT, the largest ratio of
-        the next step size to this one that the defect allows.
+        The value is INVALID if pivots are too small to compute the accelerations. The code also stores
+        FACTOR_OF_DEFECT, the largest ratio of the next step size to this one that the defect allows.
         """
         builder, num, n = emit.builder, Emitter(emit.builder), self.n
         emit.numbers = emit.constants = numbers
@@ -562,7 +560,7 @@ class CollocationCode:
         return builder.select(all_valid, defect, constant(DOUBLE, INVALID))
 
     def store_prediction(self, emit: LaneEmitter, work: Value, state: Value) -> None:
-        """Write code that stores the polynomial of the accelerations in a rejected step; it predicts a shorter step."""
+        """Write code that stores the polynomial of accelerations of a rejected step, to predict a shorter step."""
         num, old_polynomial = Emitter(emit.builder), self._polynomial_pointer(emit, work, other=False)
         with loop_over_coordinates(emit, self.iterated_coordinates) as (k, i, _, _):
             a0 = num.load(num.pointer(state, i), 2 * self.n)
@@ -573,9 +571,9 @@ class CollocationCode:
             )
 
     def end_step(self, emit: LaneEmitter, work: Value, state: Value, new_state: Value) -> None:
-        """Write code that stores [q, v, a] at the step's end in `new_state`, and the polynomial for the next step.
+        """Write code that stores [q, v, a] at the end of the step in `new_state`.
 
-        The polynomial predicts accelerations; the code also stores its degree, NEXT_DEGREE, see `_choose_degree`.
+        To predict the next step, it also stores the polynomial of the accelerations and, as NEXT_DEGREE, its degree.
         """
         builder, num, n = emit.builder, Emitter(emit.builder), self.n
         last, h = LANES - 1, num.load(work, mem.H)
@@ -620,11 +618,11 @@ class CollocationCode:
                 num.store(builder.extract(a, last), target, 2 * n)
 
     def _choose_degree(self, emit: LaneEmitter, work: Value, max_error: Value) -> None:
-        """Write code that stores NEXT_DEGREE, the lowest degree that predicts nearly as well as the best one.
+        """Write code that stores NEXT_DEGREE, the degree of the polynomial that predicts the next step.
 
-        Its prediction error is at most 1.2 times the smallest one. It is at least 2, and differs from DEGREE by at most
-        2. If this step was not predicted, it is FIRST_DEGREE. `max_error`: for each lane k, the error that a
-        prediction of degree k + 1 has at the end of this step.
+        `max_error`: in lane k, the error that a prediction of degree k + 1 would have had at the end of this step.
+        NEXT_DEGREE is the lowest degree whose error is at most 1.2 times the smallest one, but at least 2, and at most
+        2 lower or higher than DEGREE, used for this step. If no polynomial predicted this step, it is FIRST_DEGREE.
         """
         builder, num = emit.builder, Emitter(emit.builder)
         least = -emit.max_over_lanes(-max_error)
@@ -639,14 +637,14 @@ class CollocationCode:
         num.store(builder.select(predicts, degree, constant(DOUBLE, FIRST_DEGREE)), work, mem.NEXT_DEGREE)
 
     def project_positions(self, emit: LaneEmitter, work: Value, numbers: Value) -> None:
-        """Write code for a Newton step towards C = 0 from the positions at the ends of eight steps; see `_project`."""
+        """Write code for one Newton step towards C = 0, from the positions at the ends of eight steps at once."""
         if self.split_functions is None:
             self._project(emit, work, numbers, self.equations.position_projection)
         else:
             self._project_in_parts(emit, work, numbers, self.split_functions.project_position, ("moved", "q"))
 
     def project_states(self, emit: LaneEmitter, work: Value, numbers: Value) -> None:
-        """Write code that projects the ends of eight steps, and stores accelerations, multipliers; see `_project`."""
+        """Write code that projects the ends of eight steps at once, with accelerations and multipliers."""
         if self.split_functions is None:
             self._project(emit, work, numbers, self.equations.projection)
         else:
@@ -655,7 +653,7 @@ class CollocationCode:
     # methods that write parts of functions
 
     def _project(self, emit: LaneEmitter, work: Value, numbers: Value, program: Program) -> None:
-        """Write code that projects the ends of eight steps by `program`; it stores MOVED, and VALID = 0 if invalid."""
+        """Write code that projects the ends of eight steps by `program`, and stores the results in `work`."""
         emit.numbers = emit.constants = numbers
         inputs = [load_lanes(emit, work, self.end_offset + LANES * k) for k in range(1 + 2 * self.n)]
         lowering, arrays = lower_program(emit, program, inputs, self.numbers)
@@ -669,7 +667,7 @@ class CollocationCode:
     def _project_in_parts(
         self, emit: LaneEmitter, work: Value, numbers: Value, write: Callable[..., Value], names: tuple[str, ...]
     ) -> None:
-        """Do the same as `_project` by a method `write` of SplitFunctions; its code stores the arrays `names`."""
+        """Do the same as `_project` for equations split into several functions: `write` writes the calls of these."""
         num, moved = Emitter(emit.builder), emit.builder.allocate(DOUBLE, LANES * self.n)
         indices = {name: num.pointer(work, index) for name, index in self._end_offsets().items()} | {"moved": moved}
         state = load_lanes(emit, work, self.end_offset), indices["q"], indices["v"]
@@ -677,7 +675,7 @@ class CollocationCode:
         self._store_largest_move(emit, work, [load_lanes(emit, moved, LANES * k) for k in range(self.n)], is_valid)
 
     def _end_offsets(self) -> dict[str, int]:
-        """Return the indices in `work` at which the arrays "q", "v", "a" and "lam" of the ends of eight steps begin."""
+        """Return where arrays for the ends of eight steps begin in `work`; keys: "q", "v", "a" and "lam"."""
         return {
             "q": self.end_offset + LANES,
             "v": self.end_offset + LANES * (1 + self.n),
@@ -709,7 +707,7 @@ class CollocationCode:
     def _store_stages(
         self, emit: LaneEmitter, work: Value, state: Value, k: Value, i: Value, sums: Sequence[Value]
     ) -> Value:
-        """Write code that stores v and q of the k-th iterated coordinate, i; return v. `sums`: integrals of a."""
+        """Write code that stores v and q of the k-th iterated coordinate, i, from the integrals `sums` of a; return v."""
         num = Emitter(emit.builder)
         h = emit.broadcast(num.load(work, mem.H))
         index, begin = num.pointer(work, k * LANES), num.pointer(state, i)
@@ -721,7 +719,7 @@ class CollocationCode:
         return v
 
     def _node_accelerations(self, emit: LaneEmitter, first: Value, work: Value, i: Value | int) -> list[Value]:
-        """Return the accelerations of coordinate i at all nodes: `first` at node 0, and eight values from `work`."""
+        """Return the accelerations of coordinate i at the nine nodes: `first`, and eight values loaded from `work`."""
         num = Emitter(emit.builder)
         memory = num.pointer(work, i * LANES)
         return [first, *(num.load(memory, self.a_offset + node) for node in range(LANES))]
@@ -729,18 +727,18 @@ class CollocationCode:
     def _weighted_accelerations(
         self, emit: LaneEmitter, table: Array, first: Value, work: Value, i: Value | int
     ) -> Value:
-        """Apply a matrix of `Tables` to the accelerations of coordinate i at the nodes; `first`: the one at node 0."""
+        """Return (accelerations of coordinate i at the nodes) @ table; `first`: the acceleration at node 0."""
         return self._weighted_sum(emit, table, self._node_accelerations(emit, first, work, i))
 
     def _weighted_sum(self, emit: LaneEmitter, table: Array, terms: Sequence[Value]) -> Value:
-        """Return the sum over k of terms[k] times row k of `table`; two partial sums are faster than one."""
+        """Return `terms @ table`; its terms are added up in two sums, which do not wait for each other."""
         sums = [emit.broadcast(x) * constants(row) for x, row in zip(terms[:2], table[:2], strict=True)]
         for k, (x, row) in enumerate(zip(terms[2:], table[2:], strict=True)):
             sums[(k + 1) % 2] = emit.fma(emit.broadcast(x), constants(row), sums[(k + 1) % 2])
         return emit.add_sums(*sums)
 
     def _polynomial_pointer(self, emit: LaneEmitter, work: Value, other: bool) -> Value:
-        """Return a pointer to the stored polynomial of the last accepted step or, if `other`, of the attempted step."""
+        """Return a pointer to the polynomial that predicts this step or, if `other` is true, the next step."""
         builder, num = emit.builder, Emitter(emit.builder)
         second = builder.compare("fcmp one" if not other else "fcmp oeq", num.load(work, mem.CURRENT), llvm_code.ZERO)
         size = LANES * len(self.iterated_coordinates)
@@ -753,7 +751,7 @@ class Collocation(NamedTuple):
 
     functions: DeferredFunctions
     code: CollocationCode
-    numbers: Any  # coefficients that functions read: values or, in cached objects, expressions in the parameters
+    numbers: Any  # coefficients: their values or, in the object cached for all systems, expressions in the parameters
 
 
 def compiled_collocation(generated: GeneratedCode) -> Collocation:
@@ -781,7 +779,7 @@ def _compile(shared: SharedCode) -> Collocation:
         module = Module(splits_blocks=is_split)
         for name, emit in writers.items():
             llvm_code.write(module, name, KIT.llvm_signature(name), emit, partial(LaneEmitter, lanes=LANES))
-        # if coefficients were added while writing, the functions would read beyond the end of the array
+        # all coefficients were known before writing: else the functions would read beyond the end of their array
         assert len(code.numbers.values) == len(numbers)
         return list(writers), str(module)
 
@@ -793,5 +791,5 @@ def _compile(shared: SharedCode) -> Collocation:
 
 @cache
 def _stamp() -> str:
-    """Return a digest of the modules that write only these functions; `SharedCode.digest` covers the other modules."""
+    """Return a digest of the modules that write only collocation code; `SharedCode.digest` covers the other modules."""
     return digest_of("", __file__, lane_series, mem)
