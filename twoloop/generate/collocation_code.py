@@ -707,7 +707,7 @@ class CollocationCode:
     def _store_stages(
         self, emit: LaneEmitter, work: Value, state: Value, k: Value, i: Value, sums: Sequence[Value]
     ) -> Value:
-        """Write code that stores v and q of the k-th iterated coordinate, i, from the integrals `sums` of a; return v."""
+        """Write code that stores v and q of the k-th iterated coordinate, i; return v. `sums`: integrals of its a."""
         num = Emitter(emit.builder)
         h = emit.broadcast(num.load(work, mem.H))
         index, begin = num.pointer(work, k * LANES), num.pointer(state, i)

@@ -4,13 +4,13 @@ The operations of an elimination become LLVM instructions one by one, without nu
 hundred operations. The code is cached on disk, like the code of the kernels.
 
 **Accelerations** are computed by one of two programs. The program with the fewest operations (null_space.py) divides by
-fixed pivots. If one of these pivots is small, another function of the LLVM module computes the accelerations by an
-elimination that begins with M. In SIMD lanes, this function is called for all lanes if one lane needs it; the other
-lanes keep their results, so that the result of a run does not depend on the runs in other lanes.
+pivots that are chosen before the run. If one of them is small, another function of the LLVM module computes the
+accelerations, by an elimination that begins with the mass matrix M. In SIMD lanes, this function is called for all
+lanes if one lane needs it; the other lanes keep their results, so that no run depends on the runs in other lanes.
 
-**Long equations** are split into functions that call one another, each compiled once: the compile time of LLVM grows
-faster than the length of a block. Functions exchange values in memory; a long block needs memory for them, too.
-Accelerations and both projections call the same functions for the factors of the matrix and for the solution.
+**Long equations** are split into functions: the compile time of LLVM grows faster than the length of a function.
+Accelerations and both projections call the same functions for the factors of the matrix and for the solution. These
+functions exchange values in memory; in one long function, most values would be kept in memory, too.
 """
 
 import ctypes
@@ -36,8 +36,8 @@ from twoloop.kernels.compile.generated_functions import generated_functions
 from twoloop.problem.system import ConstrainedSystem
 
 DOUBLE_POINTER = f"{DOUBLE}*"
-# if generated code adds rows of G to M, or refines solutions (see PivotChoice), the relative error of its accelerations
-# is measured near the start (`_loss`). Above this limit, raise Untraceable. During runs, errors grew up to 200 times
+# if the relative error of accelerations near the start is larger, generated code is not used. This is checked only if
+# rows of G are added to M, or solutions are refined (see PivotChoice). During runs, the error grew up to 200 times
 LARGEST_LOSS = 1e-8
 MAX_POSITIONS, DISTANCE = 4, 0.02  # `_loss` tries at most this number of positions, with this spacing (m or rad)
 
@@ -45,9 +45,9 @@ MAX_POSITIONS, DISTANCE = 4, 0.02  # `_loss` tries at most this number of positi
 def write_accelerations(
     emit: Emitter, equations: Elimination, inputs: Sequence[Value], numbers: Coefficients
 ) -> tuple[list[Value], Value]:
-    """Write code for the accelerations at `inputs`, [t, q, v]; return the accelerations and a flag: they are valid.
+    """Write code for the accelerations at `inputs`, [t, q, v]; return the accelerations and a flag: 1 if valid.
 
-    `numbers` assigns the indices of coefficients in memory; `emit` must have pointers to this memory.
+    `numbers`: the coefficients and their indices in an array; `emit` must have pointers to this array.
     """
     lowering, n = Lowering(emit, numbers), equations.system.n_q
     for quantity, value in enumerate(inputs):
@@ -67,7 +67,7 @@ def write_acceleration_function(
 ) -> None:
     """Write the LLVM function `name`, which computes accelerations from t, q, v and the coefficients.
 
-    It stores valid accelerations in its last argument, and returns whether they are valid. `kind`: its LLVM types.
+    If they are valid, it stores them in its last argument and returns 1; else it returns 0. `kind`: its LLVM types.
     """
 
     def emit_all(emit: Emitter, t: Value, q: Value, v: Value, coefficients: Value, out: Value) -> Value:
@@ -90,10 +90,10 @@ def _store_if_valid(emit: Emitter, is_valid: Value, pointers: Sequence[Value], a
 def call_accelerations(
     emit: Emitter, equations: Elimination, index: int, inputs: Sequence[Value], numbers: Coefficients, out: Value
 ) -> Value:
-    """Write a call of a function that stores accelerations at `inputs`, [t, q, v], in `out`; return its flag: valid.
+    """Write a call of a function that computes accelerations at `inputs`, [t, q, v]; return its flag: 1 if valid.
 
-    `index`: which program of `equations.accelerations` the function runs. 0: program with the fewest operations; -1:
-    elimination that begins with M. `numbers`: Coefficients, which assigns indices to coefficients.
+    The function stores them in `out`. `index`: 0 for the program with the fewest operations, -1 for the elimination
+    that begins with M. `numbers`: the coefficients and their indices in an array.
     """
     state = _stack_array(emit, 2 * equations.system.n_q)
     for i, value in enumerate(inputs[1:]):
@@ -105,9 +105,9 @@ def call_accelerations(
 def _accelerations(
     emit: Emitter, equations: Elimination, lowering: Lowering, state: Callable[[], list[Value]]
 ) -> tuple[list[Value], Value]:
-    """Write code for the accelerations; return the accelerations and a flag: they are valid.
+    """Write code for the accelerations; return the accelerations and a flag: 1 if they are valid.
 
-    `lowering`: writer that already has t, q and v. If pivots are small, the written code calls a function whose
+    `lowering`: Lowering in which t, q and v are defined. If pivots are small, the written code calls a function whose
     elimination begins with M; `state()` returns the first arguments of this call: t, and pointers to q and v.
     """
     program, *alternatives = equations.accelerations
@@ -163,7 +163,7 @@ def _acceleration_function(emit: Emitter, equations: Elimination, index: int, nu
 
 
 def _coefficient_pointers(emit: Emitter) -> list[Value]:
-    """Return the pointers to coefficients: one; in SIMD lanes two: to varying and to constant coefficients."""
+    """Return pointers to the coefficients: in SIMD lanes, two, to those that differ between lanes and to the others."""
     constants = getattr(emit, "constants", None)
     return [emit.numbers] if constants is None else [emit.numbers, constants]
 
@@ -172,19 +172,19 @@ def _stack_array(emit: Emitter, size: int) -> Value:
     return emit.builder.allocate(DOUBLE, size * width_of(emit.double_type))
 
 
-# equations with more operations than this are split into functions. If null_space.py yields a `reduced_program`, the
-# limit is SPLIT_PROJECTIONS, and only projections are split: this halves the compile time. If not, the limit is
-# SPLIT_ALL, and projections and accelerations are split: this makes accelerations 50 % slower
+# equations with more operations than this are split into functions. If null_space.py yields a short program for the
+# accelerations, the limit is SPLIT_PROJECTIONS, and only projections are split: this halves the compile time. If not,
+# the limit is SPLIT_ALL, and projections and accelerations are split: this makes accelerations 50 % slower
 SPLIT_PROJECTIONS, SPLIT_ALL = 200, 500
 
 
 class SplitFunctions:
-    """Generator that splits long equations into parts: functions of the LLVM module that other functions call.
+    """Generator that splits long equations into parts: LLVM functions, called for accelerations and for projections.
 
-    solution : programs for the factors of the linear equations M a + G^T lam = r, G a = c, and for the solution;
-        `stored_indices` lists the quantities that the parts exchange in memory.
-    position_programs : programs with inputs t, q, v; keys: names of the parts that execute them.
-    solution_programs : programs with inputs r, c and the stored factors; keys: names of the parts that execute them.
+    The part "factors" factorizes the matrix of M a + G^T lam = r, G a = c, and stores what the other parts need.
+    solution : programs for these factors and for the solution.
+    position_programs : programs of parts that compute right-hand sides r and c from t, q and v; keys: names of parts.
+    solution_programs : programs of parts that solve for r and c with the stored factors; keys: names of parts.
     """
 
     def __init__(self, equations: Elimination, numbers: Coefficients):
@@ -208,7 +208,7 @@ class SplitFunctions:
             self._part_writers[name] = partial(self._write_part, program, {})
 
     def structure(self) -> Iterable[Any]:
-        """Yield everything that the functions depend on, except values of coefficients; it identifies them."""
+        """Yield all that determines the code of the functions: its digest is the key of cached code."""
         solution, numbers = self.solution, self.numbers
         yield solution.factor_program.sizes, list(numbers.structure(solution.factor_program))
         for program in self.position_programs.values():
@@ -217,7 +217,7 @@ class SplitFunctions:
             yield program.sizes, list(numbers.structure(program))
 
     def write(self, module: Module, kinds: Callable[[str], tuple[str, list[str]]]) -> list[str]:
-        """Write the functions that kernels call; return their names. `kinds(name)`: LLVM types of a function."""
+        """Write the functions that kernels call; return their names. `kinds(name)`: types of result and arguments."""
         functions: dict[str, Callable[..., Any]]
         functions = {"own_correct_positions": self.project_position, "own_project": self.project}
         if self.equations.reduced_program is None:
@@ -229,7 +229,7 @@ class SplitFunctions:
     # methods that write the functions of the parts
 
     def _call(self, emit: Emitter, *calls: tuple[str, Sequence[Value]]) -> Value:
-        """Write calls of parts, given as (name, arguments), and parts not yet written; return a flag: all are valid."""
+        """Write calls, given as (part, arguments), and the parts that are missing; return a flag: 1 if all return 1."""
         module, all_valid = emit.builder.module, None
         for part, arguments in calls:
             name = f"{part}_{emit.suffix}"
@@ -242,7 +242,7 @@ class SplitFunctions:
         return all_valid
 
     def _lowering(self, emit: Emitter, graph: Graph, args: Sequence[Value], stored: Mapping[int, Location]) -> Lowering:
-        """Return a Lowering that writes a part; `args`: its arguments: three inputs, coefficients, then others."""
+        """Return a Lowering that writes the code of a part. `args`: three inputs, pointer to coefficients, others."""
         *inputs, emit.numbers = args[:4]
         if width_of(emit.double_type) > 1:
             emit.constants = emit.numbers  # type: ignore[attr-defined]  # the coefficients are the same in all lanes
@@ -251,7 +251,7 @@ class SplitFunctions:
         return lowering
 
     def _write_factors(self, emit: Emitter, *arguments: Value) -> Value:
-        """Write a part that stores factors, and quantities for other parts, in `arguments[4]`; return a flag: valid."""
+        """Write the part "factors", which stores factors in `arguments[4]`; return a flag: 1 if pivots are large."""
         graph, solution, stored = self.equations.graph, self.solution, arguments[4]
         lowering = self._lowering(emit, graph, arguments, {})
         locations = {i: (stored, index) for i, index in solution.stored_indices.items()}
@@ -262,7 +262,7 @@ class SplitFunctions:
         return lowering.is_valid(solution.factor_program, [])
 
     def _write_part(self, program: Program, stored: Mapping[int, int], emit: Emitter, *arguments: Value) -> Value:
-        """Write a part that runs `program`; return a flag: valid. `stored`: memory indices of quantities to load."""
+        """Write a part that runs `program`; return a flag: 1 if valid. `stored`: indices in memory, by quantity."""
         locations = {i: (arguments[4], index) for i, index in stored.items()}
         lowering = self._lowering(emit, program.graph, arguments, locations)
         results = program.run(lowering)
@@ -274,7 +274,7 @@ class SplitFunctions:
     # methods that other classes also call; arguments: emitter, time t, then pointers (`numbers`: to the coefficients)
 
     def accelerations(self, emit: Emitter, t: Value, q: Value, v: Value, numbers: Value, a: Value) -> Value:
-        """Write code that stores the accelerations at (t, q, v) in `a`; return the flag whether they are valid."""
+        """Write code that stores the accelerations at (t, q, v) in `a`; return a flag: 1 if they are valid."""
         stored, r, c, lam = self._stack_arrays(emit)
         inputs = [t, q, v, numbers, stored]
         return self._call(
@@ -284,9 +284,9 @@ class SplitFunctions:
     def project_position(
         self, emit: Emitter, t: Value, q: Value, v: Value, numbers: Value, moved: Value, out: Value
     ) -> Value:
-        """Write code for a Newton step towards C = 0. It stores the corrected q in `out`, and its change in `moved`.
+        """Write code for a Newton step towards C = 0; return a flag: 1 if its result is valid.
 
-        Return the flag (a Value) whether both are valid. `numbers`: pointer to the coefficients of the equations.
+        The code stores the corrected q in `out`, and its change in `moved`. `numbers`: pointer to the coefficients.
         """
         stored, r, c, lam = self._stack_arrays(emit)
         inputs = [t, q, v, numbers, stored]
@@ -314,7 +314,7 @@ class SplitFunctions:
         new_v: Value,
         lam: Value,
     ) -> Value:
-        """Write code that projects q and v onto the constraints in the metric of M; return a flag: results are valid.
+        """Write code that projects q and v onto the constraints in the metric of M; return a flag: 1 if valid.
 
         The code stores the change of q in `moved`, the projected q and v in `new_q` and `new_v`, and the accelerations
         and multipliers at the new v in `a` and `lam`. `numbers`: pointer to the coefficients of the equations.
@@ -343,7 +343,7 @@ class SplitFunctions:
         return is_valid
 
     def _stack_arrays(self, emit: Emitter) -> list[Value]:
-        """Return pointers to new arrays on the stack: stored quantities; right sides r, c; change of v or lam."""
+        """Return pointers to new arrays: for stored quantities; right-hand sides r and c; a change of v, or lam."""
         sizes = self.solution.n_stored, self.n, self.n_rows, max(self.n, self.n_rows)
         return [_stack_array(emit, size) for size in sizes]
 
@@ -391,10 +391,10 @@ def write_function(
 
 
 class SharedCode:
-    """Compiled functions for the equations of one or more systems; cached functions are read from the disk.
+    """Compiled functions for the equations of systems that differ only in parameters, cached on disk.
 
-    numbers : Coefficients (program.py) that the functions read from an array.
-    digest : digest of everything that the functions depend on, except the values of coefficients.
+    numbers : coefficients of the equations, with their indices in the array from which the functions read them.
+    digest : digest of all that determines the functions, except values of `numbers`: the key of cached functions.
     """
 
     def __init__(self, equations: Elimination, cache: TraceCache):
@@ -446,7 +446,7 @@ class GeneratedCode(NamedTuple):
     shared: SharedCode
     numbers: Array  # values of the coefficients that the code reads
     traced: CallbackTraces
-    evaluate: Evaluator  # function that evaluates expressions in the parameters for the parameters of this system
+    evaluate: Evaluator  # computes expressions in the parameters with the values that they have in this system
 
     @property
     def kinds(self) -> frozenset[str]:
@@ -454,7 +454,7 @@ class GeneratedCode(NamedTuple):
         return self.traced.kinds
 
     def is_valid_from(self, system: ConstrainedSystem, t0: float, q0: Array) -> bool:
-        """Return True if a run may start at (t0, q0) with this code: if the PivotChoice is the same there."""
+        """Return True if a run may start at (t0, q0) with this code: if the same rows and pivots are chosen there."""
         try:
             return _choice_at(system, t0, q0) == self.shared.equations.choice
         except Untraceable:
@@ -462,7 +462,7 @@ class GeneratedCode(NamedTuple):
 
 
 def _choice_at(system: ConstrainedSystem, t: float, q: Array) -> PivotChoice:
-    """Return the PivotChoice at a position; the choice at the last position is cached."""
+    """Return the choice of rows and pivots for the elimination at a position; the last one is cached."""
     choice: PivotChoice
     choice = system.remembered_at("choice", (t, q.tobytes()), lambda: PivotChoice.choose(system, t, q))
     return choice
@@ -491,7 +491,7 @@ def _loss(code: GeneratedCode, system: ConstrainedSystem, t0: float, q0: Array) 
     """Return the relative error of accelerations by generated code, at rest, at the start (t0, q0) or near it.
 
     At most MAX_POSITIONS positions are tried until pivots are large enough; if they never are, return infinity. Two
-    generated functions compute accelerations, with and without a projection: the larger error of the two is returned.
+    generated functions compute accelerations, one of them after a projection: return the larger one of their errors.
     """
     rows, n = list(code.shared.equations.choice.rows), system.n_q
     v, a, reduced, lam = np.zeros(n), np.empty(n), np.empty(n), np.empty(system.n_c + system.n_a)
@@ -512,7 +512,7 @@ def _loss(code: GeneratedCode, system: ConstrainedSystem, t0: float, q0: Array) 
         right, exact = np.concatenate([force, gamma[rows]]), np.zeros(n + len(rows))
         for _ in range(3):  # the first pass solves, the others refine the solution
             exact += np.linalg.solve(matrix, right - matrix @ exact)
-    except ValueError:  # nothing to compare with: gamma by differences, undefined forces, or a singular matrix
+    except ValueError:  # no exact solution: gamma is by differences, forces are undefined, or the matrix is singular
         return 0.0
     heavy = mass.diagonal() > 0.0
     size = max(np.abs(exact[:n]).max(), np.abs(force[heavy] / mass.diagonal()[heavy]).max(initial=0.0))

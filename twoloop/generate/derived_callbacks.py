@@ -20,15 +20,14 @@ from twoloop.generate.trace import GAMMA_SOURCES, Equations, Evaluator, TraceCac
 from twoloop.generate.traced_values import CallbackTraces, Check, accept_traces
 from twoloop.problem.system import ConstrainedSystem
 
-# keys: callbacks that are derived if the user does not give them; values: attribute of a system, its number of rows
+# keys: callbacks that are derived if the user does not give them; values: attribute of a system with their row number
 DERIVABLE_CALLBACKS = {"jacobian": "n_c", "gamma": "n_c", "nonholonomic_gamma": "n_a"}
 
 
 class DerivedPrograms:
-    """Programs that replace missing callbacks, shared by all systems that have the same TraceCache (trace.py).
+    """Programs that replace missing callbacks, shared by all systems whose callbacks have the same traces.
 
-    programs : keys: kinds of callbacks; values: a program, and the indices of its results in the flattened array of the
-        callback.
+    programs : keys: kinds of callbacks; values: a program, and indices of its results in the flattened callback array.
     traced : the traces that the programs were derived from.
     """
 
@@ -61,8 +60,8 @@ class DerivedSystem(NamedTuple):
 def derive_callbacks(system: ConstrainedSystem, check: Check) -> tuple[ConstrainedSystem, tuple[CallbackTraces, ...]]:
     """Return a system with programs in place of missing callbacks for C_q and gamma, and the traces used for them.
 
-    If no callback is missing, or callbacks cannot be traced, return the system itself and an empty tuple. If callbacks
-    cannot be traced, finite differences replace the missing ones. `check` raises Untraceable if the traces are wrong.
+    If no callback is missing, or callbacks cannot be traced, return `system` itself and an empty tuple: finite
+    differences then replace missing callbacks. `check` raises Untraceable if the traces are wrong.
     """
     missing = [kind for kind, size in DERIVABLE_CALLBACKS.items() if getattr(system, size) and kind not in system.given]
     if not missing:
@@ -88,7 +87,7 @@ def _derive_programs(system: ConstrainedSystem, missing: Sequence[str], cache: T
 
 
 def _missing_derivatives(equations: Equations, missing: Sequence[str]) -> dict[str, dict[int, Affine]]:
-    """Return expressions of the missing "jacobian" and "gamma" (rows of C, then of A); keys: indices in flat array."""
+    """Return expressions for "jacobian" (nonzero entries of C_q, flattened) and "gamma" (all rows of C, then of A)."""
     system = equations.system
     gamma: dict[int, Affine] = {}
     for kind, first in (("gamma", 0), ("nonholonomic_gamma", system.n_c)):
@@ -103,7 +102,7 @@ def _missing_derivatives(equations: Equations, missing: Sequence[str]) -> dict[s
 Array = NDArray[np.float64]
 
 MAX_ENTRIES = 50_000  # callbacks are not compared with exact derivatives if G = [C_q; A] has more entries
-# derivatives are compared at the start, displaced by this fraction of the sizes of q, and of FIRST_TIME_SCALE (s)
+# derivatives are compared at three states: at the start, displaced by these multiples of the sizes of q, and of time
 DISPLACEMENTS = (0.0, 1e-3, 0.03)
 
 
@@ -125,7 +124,7 @@ def _trace_derivatives(system: ConstrainedSystem, cache: TraceCache) -> Callback
     equations = cache.equations(system)
     callbacks = [kind for kind in ("jacobian", *GAMMA_SOURCES) if kind in system.given]
     exprs = {kind: equations.derivatives(kind) for kind in (*callbacks, *(["constraint_rate"] if system.n_c else []))}
-    # derivatives are correct only if the callbacks that were differentiated agree with their traces: compare these, too
+    # also compare the callbacks that were differentiated with their traces: only then are the derivatives correct
     exprs |= {kind: equations.expressions(kind) for kind in ("constraint", "nonholonomic", "nonholonomic_rate")}
     return CallbackTraces(system, equations.graph, exprs)
 
@@ -158,7 +157,7 @@ def has_exact_derivatives(system: ConstrainedSystem, t: float, q: Array, v: Arra
 
 
 def generic_states(states: Sequence[tuple[float, Array, Array]]) -> Array:
-    """Return rows [t, q, v] with t and q of `states`, and random nonzero v, at least about as large as given v."""
+    """Return rows [t, q, v] with t and q of `states`, and random velocities v that are not smaller than the given v."""
     times, positions, velocities = (np.array(values, dtype=float) for values in zip(*states, strict=True))
     generic_v = np.array([sizes(q) for q in positions]) * _random_factors(*positions.shape)
     scale = max(1.0, float(np.abs(velocities).max()) / float(np.abs(generic_v).max()))
