@@ -2,12 +2,8 @@
 
 A mechanism's Jacobian has few nonzero entries, and their pattern does not change. So the order of elimination is chosen
 once for each partition (Markowitz's rule with a threshold), and written as a program, a list of operations. Later
-factorizations follow this program, without a search for pivots and without tests for zeros. If multipliers of the
-elimination become large, another order is chosen. Factors are dense if the program is nearly as long as for a full
-matrix.
-
-To choose an order, entries are stored in lists by row and by column, and each step of the elimination uses only the
-lists that it changes. So the work grows as the number of rows times the number of entries, not as the rows cubed.
+factorizations follow this program, without a search for pivots and without tests for zeros. If entries of L become
+large, another order is chosen. Factors are dense if sparse ones would need more than half of their operations.
 
 The factors of a matrix are two arrays: `index`, the program, and `values`. Right-hand sides and solutions are in the
 order of elimination: entry k of a right-hand side belongs to row rows_of(index)[k] of the Jacobian, and entry k of a
@@ -17,46 +13,50 @@ solution to column columns_of(index)[k].
 from twoloop.kernels.data.common import compiled, inlined, merged
 from twoloop.kernels.linalg.dense import copy, lu_factor, lu_sign, lu_solve
 
-MIN_PIVOT_RATIO = 0.1  # smallest entry that may be a pivot, relative to the largest entry in its column
+MIN_PIVOT_RATIO = 0.1  # an entry may be a pivot if its magnitude is at least this fraction of the largest in its column
 MAX_SPARSE_RATIO = 0.5  # sparse factors are used if they need at most this share of the subtractions of dense factors
-MAX_SPARSE_ROWS = 3  # up to this number of rows, factors are sparse whatever the number of subtractions
-ZERO_PIVOT = 1e-11  # if a pivot is at most this fraction of the largest pivot before it, the matrix is singular
+MAX_SPARSE_ROWS = 3  # matrices of at most this number of rows have sparse factors, without regard to MAX_SPARSE_RATIO
+ZERO_PIVOT = 1e-11  # if |pivot| is at most this fraction of the largest |pivot| before it, the matrix is singular
 # if a program for r rows needs more than MIN_SUBTRACTIONS + SUBTRACTIONS_PER_ROW * r subtractions, factors are dense
 MIN_SUBTRACTIONS, SUBTRACTIONS_PER_ROW = 2000, 100
 MAX_ENTRIES_PER_LINE = 64  # largest number of entries in a row or column of sparse factors; with more, they are dense
 
-ORDER_CHOSEN, SINGULAR_MATRIX, TOO_MANY_ENTRIES = range(3)  # codes of `choose_order`; the last means: use dense factors
+# codes of `choose_order`: success; the matrix is singular; sparse factors are not faster than dense ones
+ORDER_CHOSEN, SINGULAR_MATRIX, TOO_MANY_ENTRIES = range(3)
 
 # indices of the numbers at the beginning of `index`, the program of a factorization
 (
-    SIZE,  # number of rows r
+    SIZE,  # number of rows of the factored matrix
     DENSE,  # 1: the factors are dense; 0: they are sparse
     SIGN,  # sign (1 or -1) of the permutation of rows times the sign of the permutation of columns
-    N_SLOTS,  # number of entries of the sparse factors
-    FIRST_LOWER,  # index in `values` of the first entry of L
-    WIDTH,  # number of columns of the Jacobian
+    N_SLOTS,  # number of entries of the sparse factors L and U, with fill-in
+    FIRST_LOWER,  # index of the first entry of L in `values`, the array of the factors
+    WIDTH,  # number of columns of the whole Jacobian
     N_HEAD,
 ) = range(7)
-# After these numbers, `index` contains the arrays below (r: number of rows). The entries of the factors are numbered in
-# this order: diagonal; U without diagonal, from its last row up; L row by row
-# - rows (r) and columns (r) of the matrix in the order of elimination; row exchanges of dense factors (r)
-# - for each row of U, the number of its first entry (r); for each row of U, 1 + the number of its last entry (r)
-# - for each row of L, the number of its first entry (r); 1 + the number of the last entry of L
-# - the row of each entry; the column of each entry; the source of each entry: the index of its initial value in
-#   `entries`, an argument of `factor`, or of a zero for fill-in
-# - for each subtraction, the number of the entry that it changes; then the lists of `views_of_lists`
+# After these numbers, `index` contains the arrays below. The array `values` contains the diagonal, then U from its last
+# row up, then L row by row
+# - row indices of the Jacobian, then its column indices, both in the order of elimination
+# - row exchanges by `lu_factor`, if the factors are dense
+# - where each row of U begins in `values`; where each row of U ends; where each row of L begins; where L ends
+# - for each entry of `values`: its row and its column, as positions in the order of elimination; its source, which is
+#   the index of its initial value in the argument `entries` of `factor` (for fill-in, the index of a zero there)
+# - for each subtraction of an elimination: index of the entry in `values` that it changes
+# - scratch in which `choose_order` works, see `views_of_lists`
 
-# indices in `counts` of arrays with one number for each row or column, used while an order of elimination is chosen
+# indices in `counts`, scratch for choosing an order: arrays with one number for each row, or for each column
 (
-    ROW_SIZE,  # number of entries in the list of a row
-    COLUMN_SIZE,  # number of entries in the list of a column, without eliminated rows
-    ACTIVE_ROW_SIZE,  # number of entries of a row in columns that are not eliminated yet
-    ROW_POSITION,  # position of a row in the order of elimination that has been chosen so far
-    COLUMN_POSITION,  # position of a column in the order of elimination that has been chosen so far
-    LOOKUP,  # scratch
+    ROW_SIZE,  # for each row: number of its entries
+    COLUMN_SIZE,  # for each column: number of its entries in rows that are not eliminated yet
+    ACTIVE_ROW_SIZE,  # for each row: number of its entries in columns that are not eliminated yet
+    ROW_POSITION,  # for each row: its position in the order of elimination that has been chosen so far
+    COLUMN_POSITION,  # for each column: its position in the order of elimination that has been chosen so far
+    LOOKUP,  # scratch, for each row or column: where its entry is stored in the list that is being changed
     N_COUNTS,
 ) = range(7)
-# indices in `lists`: for each row, the columns and the sources of its entries; for each column, the rows of its entries
+# indices in `lists`, scratch for choosing an order: lists with the entries of each row or column
+# - COLUMNS, SOURCES: for each row, the columns of its entries, and the indices of their initial values, see `factor`
+# - ROWS: for each column, the rows of its entries
 COLUMNS, SOURCES, ROWS, N_LISTS = range(4)
 
 
@@ -66,12 +66,12 @@ def index_size(r: int) -> int:
 
 
 def values_size(r: int, may_be_dense: bool = True) -> int:
-    """Return the length of `values`, the factors of a matrix of r rows; dense factors fit if `may_be_dense`."""
+    """Return the length of `values`, the array for the factors of r rows: sparse or, if `may_be_dense`, also dense."""
     return r * (r if may_be_dense else min(r, MAX_ENTRIES_PER_LINE)) + r
 
 
 def max_subtractions(r: int) -> int:
-    """Return the largest number of subtractions in a program for r rows: its memory is allocated for this number."""
+    """Return the number of subtractions in a program for r rows for which memory is allocated: no program has more."""
     return min(r * r * (r + 1) // 2, MIN_SUBTRACTIONS + SUBTRACTIONS_PER_ROW * r)
 
 
@@ -95,33 +95,34 @@ def row_exchanges_of(index):
 
 @merged
 def index_of_upper_begins(r):
-    """Return the offset of a list in `index`: for each row of U, the index of its first entry in `values`."""
+    """Return the offset of a list in the program `index`: where each row of U begins in `values`; r: number of rows."""
     return N_HEAD + 3 * r
 
 
 @merged
 def index_of_upper_ends(r):
-    """Return the offset of a list in `index`: for each row of U, 1 + the index of its last entry in `values`."""
+    """Return the offset of a list in the program `index`: where each row of U ends in `values`; r: number of rows."""
     return N_HEAD + 4 * r
 
 
 @merged
 def index_of_lower_begins(r):
-    """Return the offset of a list in `index`: for each row of L, the index of its first entry in `values`."""
+    """Return the offset of a list in the program `index`: where each row of L begins in `values`; r: number of rows."""
     return N_HEAD + 5 * r
 
 
 @merged
 def index_of_entries(r):
-    """Return the offset of a list in `index`: for each entry, its row. The lists of columns and of sources follow."""
+    """Return the offset in the program `index` of three lists: row, column and source of each entry of L and U."""
     return N_HEAD + 6 * r + 1
 
 
 @inlined
 def views_of_lists(index, values):
-    """Return views of the scratch for choosing an order: counts (N_COUNTS, r), lists (N_LISTS, r, w), values (r, w).
+    """Return views of the scratch for choosing an order: counts (N_COUNTS, r), lists (N_LISTS, r, w), numbers (r, w).
 
-    r: number of rows; w: largest number of entries in a row or column. For counts and lists see ROW_SIZE, COLUMNS.
+    r: number of rows; w: largest number of entries in a row or column; counts: see ROW_SIZE; lists: see COLUMNS.
+    `numbers` contains the values of the entries of each column.
     """
     r = index[SIZE]
     width = min(r, MAX_ENTRIES_PER_LINE)
@@ -132,7 +133,7 @@ def views_of_lists(index, values):
 
 @compiled
 def clear_lists(index, r):
-    """Store r as the number of rows in `index`, and make the lists of the matrix empty."""
+    """Prepare `index` for a matrix of r rows that `put_entry` then fills: make its lists of entries empty."""
     index[SIZE] = r
     index[DENSE] = 0
     for k in range(index.size - N_COUNTS * r, index.size):
@@ -141,7 +142,10 @@ def clear_lists(index, r):
 
 @compiled
 def put_entry(matrix, i, j, number, source):
-    """Add entry (i, j) = `number` to the lists (source: index of its initial value); return False if one is full."""
+    """Add an entry of value `number` in row i, column j to the lists of a matrix; return False if a list is full.
+
+    `source`: index of the entry's initial value in the array from which later factorizations read the matrix.
+    """
     counts, lists, numbers = matrix
     n, m = counts[ROW_SIZE, i], counts[COLUMN_SIZE, j]
     if n == numbers.shape[1] or m == numbers.shape[1]:
@@ -156,10 +160,10 @@ def put_entry(matrix, i, j, number, source):
 
 @compiled
 def _choose_pivot(matrix, rows, columns, k):
-    """Choose pivot number k; return its row and column, or (-1, -1) if no entry is large enough.
+    """Choose pivot number k by Markowitz's rule; return its row and column, or (-1, -1) if all entries are too small.
 
-    Among the entries that are large enough (see MIN_PIVOT_RATIO), choose the one that causes the least fill-in. If
-    several cause equal fill-in, choose the largest of them; among equally large ones, the first in the order so far.
+    Among the entries that are large enough (see MIN_PIVOT_RATIO), choose the one that can cause the least fill-in. If
+    there are several, choose the largest of them; among equally large ones, the first in the order so far.
     """
     counts, lists, numbers = matrix
     r = rows.size
@@ -188,7 +192,7 @@ def _choose_pivot(matrix, rows, columns, k):
 
 @merged
 def _exchange(order, position, k, chosen):
-    """Move `chosen` to position k of `order` by an exchange; return its sign, -1, or 1 if nothing was exchanged."""
+    """Exchange two entries of `order`, so that `chosen` is entry k; return -1, or 1 if it was there already."""
     previous, exchanged = position[chosen], order[k]
     order[k], order[previous] = chosen, exchanged
     position[chosen], position[exchanged] = k, previous
@@ -227,10 +231,11 @@ def _eliminate_entry(matrix, row, column, pivot, j, zero_source):
 
 @compiled
 def choose_order(index, matrix, zero_source, zero_ratio):
-    """Choose the pivots by eliminating `matrix` step by step, and store the program in `index`; return a code.
+    """Choose the pivots of a matrix by eliminating it step by step, and store the program in `index`; return a code.
 
-    Codes: ORDER_CHOSEN (`index` is complete); TOO_MANY_ENTRIES (use dense factors); SINGULAR_MATRIX (a pivot is at most
-    `zero_ratio` times the largest so far). Fill-in entries get the source `zero_source`, the index of a zero.
+    `matrix`: the views of `views_of_lists`, filled by `put_entry`; the elimination changes them. Codes: ORDER_CHOSEN
+    (`index` is complete); TOO_MANY_ENTRIES (use dense factors); SINGULAR_MATRIX (a pivot is at most `zero_ratio` times
+    the largest so far). Fill-in entries get the source `zero_source`, the index of a zero.
     """
     counts, lists, numbers = matrix
     r = index[SIZE]
@@ -261,7 +266,6 @@ def choose_order(index, matrix, zero_source, zero_ratio):
 
 @compiled
 def _sort_row(columns, sources, size, position):
-    """Sort the first `size` entries of a row, in place, by the order of elimination of their columns."""
     for n in range(1, size):
         column, source, k = columns[n], sources[n], n
         while k > 0 and position[columns[k - 1]] > position[column]:
@@ -272,9 +276,9 @@ def _sort_row(columns, sources, size, position):
 
 @compiled
 def _sort_and_count(rows, counts, lists):
-    """Sort the entries of each row by the order of elimination; return how many entries and subtractions there are.
+    """Sort each row's entries by the order of elimination; return the number of all entries, and that of subtractions.
 
-    Store in counts[ACTIVE_ROW_SIZE] the number of entries of each row of U, in the order of elimination.
+    counts[ACTIVE_ROW_SIZE, k] becomes the number of entries of row k of U, without the diagonal.
     """
     position = counts[COLUMN_POSITION]
     entries, subtractions = 0, 0
@@ -292,7 +296,7 @@ def _sort_and_count(rows, counts, lists):
 
 @compiled
 def _store_program(index, counts, lists):
-    """Store the program in `index` and return True; or, if dense factors are faster, store nothing and return False."""
+    """Store the program in `index`, and return True; if dense factors are faster, store nothing and return False."""
     r = index[SIZE]
     rows = rows_of(index)
     n_slots, subtractions = _sort_and_count(rows, counts, lists)
@@ -333,14 +337,14 @@ def _store_program(index, counts, lists):
     return True
 
 
-MAX_MULTIPLIER = 1e3  # largest accepted |multiplier| in an elimination; above, another order of elimination is chosen
+MAX_MULTIPLIER = 1e3  # if the magnitude of an entry of L exceeds this, another order of elimination is chosen
 
 
 @compiled
 def make_program(G, pattern, rows, columns, index, values):
     """Store in `index` the program that factors G[rows][:, columns]; return False if this matrix is singular.
 
-    `rows`, `columns`: indices. G may have entries only where `pattern` is not zero; `values` is scratch.
+    G: Jacobian; `rows`, `columns`: indices. Where `pattern` is 0, entries of G are always 0. `values` is scratch.
     """
     r, width = rows.size, G.shape[1]
     clear_lists(index, r)
@@ -368,10 +372,11 @@ def make_program(G, pattern, rows, columns, index, values):
 
 @merged
 def factor(entries, index, values):
-    """Store in `values` the factors of G[rows][:, columns], 1/pivot on the diagonal; return min|pivot| / max|pivot|.
+    """Factor the dependent columns of the Jacobian G by the program in `index`; return min|pivot| / max|pivot|.
 
-    `entries` is G, with a last row of zeros, as a vector. If a pivot is zero or not finite, or if a multiplier exceeds
-    MAX_MULTIPLIER, return -1 (dense factors: 0): another order of elimination must be chosen.
+    `entries` is a vector: the entries of G row by row, then a row of zeros (initial values of fill-in). The factors are
+    stored in `values`, with 1/pivot on the diagonal. If a pivot is zero or NaN, or an entry of L exceeds MAX_MULTIPLIER
+    (sparse factors only), return 0 (dense) or -1 (sparse): the caller must then choose another order of elimination.
     """
     r = index[SIZE]
     if index[DENSE] == 1:
@@ -391,7 +396,7 @@ def factor(entries, index, values):
 def run_program(index, values):
     """Factor the matrix in `values` in place, by the program in `index`; return min|pivot| / max|pivot|.
 
-    Return -1 if a pivot is zero or not finite, or if a multiplier exceeds MAX_MULTIPLIER.
+    If a pivot is zero or NaN, or if the magnitude of an entry of L exceeds MAX_MULTIPLIER, return -1.
     """
     r, n_slots = index[SIZE], index[N_SLOTS]
     column_list = index_of_entries(r) + n_slots
@@ -423,7 +428,7 @@ def run_program(index, values):
 
 @merged
 def determinant_sign(index, values):
-    """Return the sign of the determinant of the factored matrix, with rows and columns in ascending order."""
+    """Return the sign of the determinant that a factored matrix has before the reordering of its rows and columns."""
     r = index[SIZE]
     if index[DENSE] == 1:
         return lu_sign(values[: r * r].reshape((r, r)), row_exchanges_of(index))
@@ -436,7 +441,7 @@ def determinant_sign(index, values):
 
 @merged
 def solve(index, values, x):
-    """Replace the right-hand side x, in the order of `rows_of`, by the solution, in the order of `columns_of`."""
+    """Replace a right-hand side x, in the order of `rows_of`, by the solution, in the order of `columns_of`."""
     r, n_slots, first_lower = index[SIZE], index[N_SLOTS], index[FIRST_LOWER]
     if index[DENSE] == 1:
         lu_solve(values[: r * r].reshape((r, r)), row_exchanges_of(index), x)

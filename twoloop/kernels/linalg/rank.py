@@ -1,4 +1,8 @@
-"""Choose independent rows of the Jacobian G, and rows g that make M + sum s g g^T invertible; find bounds of pivots."""
+"""Choose independent rows of the Jacobian G of all constraints, so that the multipliers are unique.
+
+If the mass matrix M is singular, also choose rows g of G for which M + sum s g^T g is invertible (s: positive number).
+Find a lower bound of the pivots of G M^-1 G^T (G: independent rows), the divisors in the elimination of multipliers.
+"""
 
 import math
 
@@ -29,9 +33,9 @@ def _dot(x, y):
 
 @compiled
 def _orthogonalise(basis, n, remainder, components):
-    """Subtract from `remainder` its components along the first n rows of `basis`, which are orthonormal.
+    """Make `remainder` orthogonal to the first n rows of `basis`, which are orthonormal; return its new squared norm.
 
-    Add these components to `components`. Return the square of the norm of `remainder`.
+    Add the subtracted components along these rows to `components`.
     """
     for i in range(n):
         component = _dot(basis[i], remainder)
@@ -44,12 +48,12 @@ def _orthogonalise(basis, n, remainder, components):
 
 @merged
 def select_rows(G, min_sine, basis, factors, kept):
-    """Store in `kept` the indices of rows of G, each independent of the rows selected before; return their number.
+    """Select independent rows of G, from the first row on; store their indices in `kept`, and return their number.
 
-    A row is independent if the sine of its angle to their span exceeds `min_sine`. Its part orthogonal to these
-    is computed by Gram-Schmidt orthogonalisation, which is repeated if this part is small. On return, the rows of
-    `basis` are orthonormal, and the matrix of selected rows is the lower triangle `factors` times `basis`. Both arrays
-    have one row for each row that may be independent, and one more for scratch.
+    A row is selected if the sine of its angle to the span of the rows selected before exceeds `min_sine`. This angle is
+    found by Gram-Schmidt orthogonalisation, which is repeated if the orthogonal part of the row is small. On return,
+    the rows of `basis` are orthonormal, and the matrix of selected rows is the lower triangle `factors` times `basis`.
+    Both arrays have one row more than G can have independent rows; this row is scratch.
     """
     n_kept = 0
     for k in range(len(G)):
@@ -75,13 +79,13 @@ def select_rows(G, min_sine, basis, factors, kept):
 
 @kernel(i8(MATRIX, f8, MATRIX, MATRIX, INTEGERS), vectorized=True)
 def independent_rows(G, min_sine, basis, factors, kept):
-    """Return the result of `select_rows`; this kernel exists because Python cannot call `select_rows` itself."""
+    """Call `select_rows` and return its result: a kernel, because Python cannot call `select_rows` itself."""
     return select_rows(G, min_sine, basis, factors, kept)
 
 
 @merged
 def _fill_coefficients(n, basis, factors, row, coefficients):
-    """Store the `coefficients` (n) of the combination of the n rows from `select_rows` that is nearest to `row`."""
+    """Express `row` approximately by the n rows from `select_rows`: store the `coefficients` (n) of their sum."""
     for k in range(n):
         coefficients[k] = _dot(basis[k], row)
     for k in range(n - 1, -1, -1):
@@ -94,7 +98,7 @@ def _fill_coefficients(n, basis, factors, row, coefficients):
 def norm_of_inverse(factors, n, column):
     """Return the Frobenius norm of the inverse of the lower triangle `factors`, of n rows; `column` is scratch.
 
-    If `factors` belong to independent rows G, this norm times |c| bounds the shortest solution x of G x = c.
+    If `factors` are those from `select_rows`, all singular values of the selected rows are at least 1 / this norm.
     """
     total = 0.0
     for j in range(n):
@@ -109,11 +113,11 @@ def norm_of_inverse(factors, n, column):
 
 @kernel(types.boolean(MATRIX, INTEGERS, f8, MATRIX, MATRIX, MATRIX, INTEGERS, MATRIX, VECTOR), vectorized=True)
 def express_other_rows(rows, order, min_sine, chosen_rows, basis, factors, kept, coefficients, norms):
-    """Return False if the rows order[:n] are dependent; else express other rows as combinations of these.
+    """If n chosen rows are independent, express the other rows as linear combinations of them; else return False.
 
-    `order`: indices in `rows`; n: number of rows of `chosen_rows`, which receives the rows order[:n]. Row i of
-    `coefficients` receives the combination that is nearest to row order[n + i]; `norms` receives the norms of `rows`.
-    For the other arguments see `select_rows`.
+    The chosen rows are those with the indices order[:n] in `rows`; they are copied to `chosen_rows`, of n rows. Row i
+    of `coefficients` becomes the coefficients of the combination that is nearest to row order[n + i]. `norms` receives
+    the norms of all rows. For the other arguments see `select_rows`.
     """
     n = len(chosen_rows)
     for i in range(len(rows)):
@@ -130,9 +134,9 @@ def express_other_rows(rows, order, min_sine, chosen_rows, basis, factors, kept,
 
 @kernel(types.boolean(MATRIX, f8, MATRIX), vectorized=True)
 def singular_values_exceed(rows, ratio, gram):
-    """Return True if all singular values of a matrix A = `rows` certainly exceed `ratio` times the largest one, s.
+    """Return True if all singular values of the matrix A = `rows` certainly exceed `ratio` times the largest one.
 
-    This is so if A A^T - (ratio s)^2 I is positive definite; the Frobenius norm (>= s) replaces s. `gram` is scratch.
+    This is so if A A^T - (ratio |A|)^2 I is positive definite, where |A| is the Frobenius norm. `gram` is scratch.
     """
     n, total = len(rows), 0.0
     for i in range(n):
@@ -144,24 +148,24 @@ def singular_values_exceed(rows, ratio, gram):
     return math.isfinite(total) and ldl_factor(gram)
 
 
-BOUND_ROUNDING = 1e-12  # largest rounding error of a pivot, relative to the bound that the pivot is compared with
-NOT_DEFINITE, STAYS_SINGULAR = -1, -2  # codes: M is not positive definite; no added rows make M invertible
+BOUND_ROUNDING = 1e-12  # a bound of pivots is reduced by this fraction, so that pivots equal to it count as above it
+# codes of `choose_rows`: M with added rows is not positive definite; M is singular, and no row of G can change this
+NOT_DEFINITE, STAYS_SINGULAR = -1, -2
 TINY = 1e-300  # replaces zero as a divisor
-# If the ratio of the smallest to the largest eigenvalue of M exceeds SIMILAR_EIGENVALUES, no term s g g^T is added to
-# M, and pivots of S = G M^-1 G^T, scaled to a diagonal of 1, decide whether a row of G is independent of previous rows:
-# it is if its pivot exceeds INDEPENDENT. Then its part orthogonal to them is at least 3e-9 of its norm, the square root
-# of INDEPENDENT * SIMILAR_EIGENVALUES. If this part is at most DEPENDENT times its norm, the row is dependent. If
-# neither holds for some row, `select_rows` decides
+# Limits that decide whether a row of G is independent of previous rows, if the smallest eigenvalue of the mass matrix M
+# exceeds SIMILAR_EIGENVALUES times the largest. S = G M^-1 G^T, scaled to a diagonal of 1, is factored. The row is
+# independent if its pivot in S exceeds INDEPENDENT: then its part orthogonal to previous rows is at least 3e-9 of its
+# norm, the square root of INDEPENDENT * SIMILAR_EIGENVALUES. The row is dependent if this part is at most DEPENDENT
+# times its norm. If neither is true of some row, or if eigenvalues differ more, `select_rows` decides for all rows
 SIMILAR_EIGENVALUES, INDEPENDENT, DEPENDENT = 1e-7, 1e-10, 1e-10
-# A redundant row is a combination of independent rows. If the coefficient of an independent row in it (rows scaled to
-# norm 1) exceeds this limit, the two rows are exchanged. This multiplies the volume that the independent rows span by
-# the coefficient: the rows are farther from becoming dependent, as at each dead centre of the slider-crank with two
-# rods. The limit exceeds 1, because equal coefficients of magnitude 1 are common, and must not lead to exchanges
+# A redundant row is a linear combination of independent rows, all scaled to norm 1. It replaces an independent row if
+# the coefficient of this row exceeds MAX_COEFFICIENT: then the independent rows are farther from becoming dependent, as
+# they do at each dead centre of a slider-crank with two rods. Coefficients of 1 are common; they must cause no exchange
 MAX_COEFFICIENT = 1.5
-# if the ratio of two coefficients is at most this, they count as equal, and the first one is chosen: in symmetrical
-# mechanisms, rounding would otherwise choose among many equal coefficients, differently at each start
+# two coefficients count as equal if their ratio is at most this; the first is chosen. Otherwise, in symmetrical
+# mechanisms, rounding errors would choose among many equal coefficients, differently at each start
 TIE_RATIO = 1.01
-ZERO_ENTRY = 1e-12  # an entry counts as zero up to this fraction of the largest in its row: the start may be rounded
+ZERO_ENTRY = 1e-12  # entries up to this fraction of the largest in their row count as zero: they may be rounding errors
 
 
 def workspace_size(n_rows: int, n: int) -> int:
@@ -172,7 +176,7 @@ def workspace_size(n_rows: int, n: int) -> int:
 
 @merged
 def _factor_and_count_negative(A):
-    """Replace a symmetric A by its factors, as `ldl_factor` does; return the number of negative eigenvalues of A."""
+    """Replace a symmetric matrix A by its L D L^T factors; return how many of its eigenvalues are not positive."""
     n, count = len(A), 0
     for k in range(n):
         if not A[k, k] > 0.0:
@@ -215,7 +219,7 @@ def _count_weak_eigenvalues(mass, weak_ratio, A):
 
 @merged
 def _sort_rows_by_entries(G, order, counts):
-    """Sort the rows of G by their numbers of nonzero entries: store indices in `order`, and the numbers in `counts`."""
+    """Sort the rows of G by their numbers of nonzero entries: store row indices in `order`, the numbers in `counts`."""
     for k in range(len(G)):
         count, i, zero = 0.0, k, ZERO_ENTRY * largest_of(G[k])
         for j in range(G.shape[1]):
@@ -228,9 +232,10 @@ def _sort_rows_by_entries(G, order, counts):
 
 @merged
 def _removes_weak_eigenvalue(A, g, scale, x):
-    """Return True if adding scale * g g^T to the mass matrix M removes one of its eigenvalues below the limit z.
+    """Return True if adding scale * g^T g to the mass matrix M raises one of its eigenvalues above the limit z.
 
-    Then det(M - z I) changes its sign. A contains the factors of M - z I, see `_count_weak_eigenvalues`; x is scratch.
+    This is so if det(M - z I) changes its sign. A contains the factors of M - z I from `_count_weak_eigenvalues`, and g
+    is a row of the Jacobian; x is scratch.
     """
     for j in range(x.size):
         x[j] = g[j]
@@ -243,11 +248,11 @@ def _removes_weak_eigenvalue(A, g, scale, x):
 
 @merged
 def _add_rows_to_mass(mass, G, weak_ratio, scale, A, x, order, added):
-    """Add scale * g g^T to the mass matrix M, for some rows g of G, until all its eigenvalues are large enough.
+    """Add scale * g^T g to the mass matrix M, for some rows g of G, until all its eigenvalues are large enough.
 
-    An eigenvalue is too small if it is less than `weak_ratio` times the largest one. Rows are tried in the sequence of
-    `order`, where -1 replaces the index of an added row. Store added indices in `added`; return their number, or
-    STAYS_SINGULAR if no row removes a small eigenvalue.
+    They must exceed `weak_ratio` times the largest. Rows are tried in the sequence of `order`, in which -1 then
+    replaces each added row. Store the indices of added rows in `added`; return their number, or STAYS_SINGULAR if
+    eigenvalues are still too small and no further row helps.
     """
     n_added = 0
     while _count_weak_eigenvalues(mass, weak_ratio, A) > 0:
@@ -280,11 +285,11 @@ def _list_rows(is_kept, kept):
 
 @compiled
 def _exchange_rows(C, is_kept, kept):
-    """Exchange independent rows with redundant rows until no coefficient exceeds MAX_COEFFICIENT.
+    """Exchange independent rows with redundant rows, so that the independent ones are farther from dependence.
 
-    Redundant row i is the sum over k of C[i, k] times independent row k, if all rows are scaled to norm 1; `is_kept` is
-    1 for independent rows, else 0. Each exchange multiplies the volume that independent rows span by the coefficient.
-    Store the indices of the independent rows in `kept`, and return their number.
+    C[i, k] is the coefficient of independent row k in redundant row i, both scaled to norm 1. These rows are exchanged
+    if |C[i, k]|, by which this multiplies the volume that the independent rows span, exceeds MAX_COEFFICIENT. Update C
+    and `is_kept` (1: independent, 0: redundant); store the indices of independent rows in `kept`, return their number.
     """
     n = len(C)
     n_kept = _list_rows(is_kept, kept)
@@ -299,7 +304,8 @@ def _exchange_rows(C, is_kept, kept):
                     largest, leaving, entering = coefficient, k, i
         if leaving < 0:
             break
-        # solve the equation of the entering (redundant) row for the leaving (independent) row; substitute it elsewhere
+        # solve the equation of the redundant row `entering` for the independent row `leaving`, and substitute the
+        # result in the equations of the other redundant rows
         inverse = 1.0 / C[entering, leaving]
         is_kept[leaving], is_kept[entering] = 0, 1
         for k in range(n):
@@ -316,7 +322,7 @@ def _exchange_rows(C, is_kept, kept):
 
 @compiled
 def _fill_scaled_products(mass, G, factors, solved, S, sizes):
-    """Store in S the upper triangle of G M^-1 G^T, scaled to a diagonal of 1; M not positive definite: return False.
+    """Store in S the upper triangle of G M^-1 G^T, scaled to a diagonal of 1; return False if M is not definite.
 
     `sizes` receives the factors that scale the rows of G, or 0 for rows of zeros. `factors` and `solved` are scratch.
     """
@@ -344,10 +350,11 @@ def _fill_scaled_products(mass, G, factors, solved, S, sizes):
 
 @compiled
 def _find_dependent_rows(S, G, sizes, U, C, remainder, is_kept):
-    """Set `is_kept` to 0 for each row of G that depends on previous rows, else to 1; return max(1 / pivot) of S.
+    """Find the rows of G that depend on previous rows, by the pivots of S, which is G M^-1 G^T with a diagonal of 1.
 
-    If it is uncertain whether a row is dependent, return 0. For S and `sizes` see `_fill_scaled_products`. C[i, k]
-    receives the coefficient of row k in a dependent row i, both scaled to norm 1. U and `remainder` are scratch.
+    Set `is_kept` to 0 for these rows, else to 1. Return the largest 1 / pivot of the other rows, or 0 if it is unclear
+    whether some row is dependent. C[i, k] becomes the coefficient of row k in a dependent row i, both scaled to norm 1.
+    S, `sizes`: results of `_fill_scaled_products`. U and `remainder` are scratch.
     """
     n_rows, largest_inverse = len(S), 1.0
     copy_matrix(S, U)
@@ -394,11 +401,11 @@ def _fill_shifted(S, kept, shift, shifted):
 
 @compiled
 def _first_bound_below_pivots(S, kept, n_kept, largest_inverse, bounds, scratch):
-    """Return the index of the first of `bounds` that is below all pivots of S; bounds.size if none is.
+    """Return the index of the first of `bounds` that is below all pivots of S; if there is none, return bounds.size.
 
-    S is the matrix G M^-1 G^T of the rows `kept` of G, scaled to a diagonal of 1. No pivot is below the smallest
-    eigenvalue of S, and this eigenvalue exceeds a bound z if S - z I is positive definite. It is at most the smallest
-    pivot, 1 / `largest_inverse` (0: unknown), so that larger bounds need no test.
+    S is G M^-1 G^T, scaled to a diagonal of 1, for the rows `kept` of G. A bound z is below all pivots, whatever the
+    order of elimination, if S - z I is positive definite. This cannot be so if z exceeds the smallest pivot, the
+    reciprocal of `largest_inverse` (0: unknown, then it is computed).
     """
     shifted = scratch[: n_kept * n_kept].reshape((n_kept, n_kept))
     if largest_inverse == 0.0:
@@ -417,10 +424,11 @@ def _first_bound_below_pivots(S, kept, n_kept, largest_inverse, bounds, scratch)
 
 
 @merged
-def _select_dependent_rows(G, min_sine, basis, factors, coefficients, C, kept, is_kept):
-    """Set `is_kept` to 1 for the rows of G that `select_rows` selects with `min_sine`, else to 0.
+def _mark_independent_rows(G, min_sine, basis, factors, coefficients, C, kept, is_kept):
+    """Set `is_kept` to 1 for the rows of G that `select_rows` selects, else to 0: these are redundant.
 
-    C[i, k] receives the coefficient of row k in a redundant row i, both scaled to norm 1. Other arguments: scratch.
+    C[i, k] becomes the coefficient of independent row k in redundant row i, both scaled to norm 1. `basis`, `factors`,
+    `coefficients` and `kept` are scratch.
     """
     n_kept = select_rows(G, min_sine, basis, factors, kept)
     for k in range(len(G)):
@@ -437,13 +445,16 @@ def _select_dependent_rows(G, min_sine, basis, factors, coefficients, C, kept, i
 
 @kernel(i8(MATRIX, MATRIX, f8, f8, VECTOR, VECTOR, INTEGERS), vectorized=True)
 def choose_rows(original_mass, G, min_sine, weak_ratio, bounds, workspace, chosen):
-    """Choose the independent rows of G, and rows g for which M + sum s g g^T is invertible (M: `original_mass`).
+    """Choose the independent rows of G, and rows g for which M + sum s g^T g is invertible (M: `original_mass`).
 
-    Rows of G are selected as in `select_rows` with `min_sine`, then exchanged as in `_exchange_rows`. Terms s g g^T are
-    added to M if it has eigenvalues below `weak_ratio` times the largest; weak_ratio = 0: none are added. `chosen`, of
-    2 + 3 n_rows numbers, receives the number of independent rows, the number of added rows, and the indices of both in
-    two lists of length n_rows. `workspace` is scratch, but workspace[0] receives s. Return the result of
-    `_first_bound_below_pivots`, or a code: STAYS_SINGULAR or NOT_DEFINITE. See generate/elimination.py.
+    Rows of G are selected as in `select_rows` with `min_sine`, then exchanged as in `_exchange_rows`. Rows g are chosen
+    if M has eigenvalues below `weak_ratio` times the largest (0: none are chosen). Return the index of the first of
+    `bounds` that is below all pivots of G M^-1 G^T, scaled to a diagonal of 1, or bounds.size if there is none; or a
+    code: STAYS_SINGULAR, NOT_DEFINITE. Other results (n_rows: number of rows of G):
+
+    - chosen[0], chosen[1]: number of independent rows, number of rows g. Two lists of length n_rows follow: the indices
+      of independent rows, and of rows g. The remaining n_rows numbers are scratch
+    - workspace[0]: the number s. The rest of `workspace` is scratch
     """
     n_rows, n = G.shape
     n_max = min(n_rows, n) + 1
@@ -465,16 +476,17 @@ def choose_rows(original_mass, G, min_sine, weak_ratio, bounds, workspace, chose
         largest_inverse = _find_dependent_rows(S, G, sizes, U, C, x, order)
     if largest_inverse > 0.0:
         chosen[0] = n_kept = _exchange_rows(C, order, kept)
-        largest_inverse = largest_inverse if n_kept == n_rows else 0.0  # 0: unknown, rows may have been exchanged
+        # the largest 1 / pivot becomes unknown (0) if there are redundant rows, because rows may have been exchanged
+        largest_inverse = largest_inverse if n_kept == n_rows else 0.0
         first_bound = _first_bound_below_pivots(S, kept, n_kept, largest_inverse, bounds, scratch)
         if first_bound < bounds.size:  # the chosen rows are certainly independent
             return first_bound
-    _select_dependent_rows(G, min_sine, basis, factors, sizes, C, kept, order)
+    _mark_independent_rows(G, min_sine, basis, factors, sizes, C, kept, order)
     chosen[0] = n_kept = _exchange_rows(C, order, kept)
     copy_matrix(original_mass, mass)
     n_added, scale = 0, 1.0
     if n_kept > 0 and weak_ratio > 0.0 and _count_weak_eigenvalues(mass, weak_ratio, A) > 0:
-        # the power of two for which the largest entries of scale * g g^T (g: a row of G) and M are about equal
+        # the power of two for which the largest entries of scale * g^T g (g: a row of G) and M are about equal
         largest, largest_of_rows = largest_of(mass.reshape(mass.size)), largest_of(G.reshape(G.size))
         scale = 2.0 ** math.floor(math.log2(largest / (largest_of_rows * largest_of_rows)) + 0.5)
         _sort_rows_by_entries(G, order, sizes)

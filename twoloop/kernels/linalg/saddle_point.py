@@ -1,6 +1,6 @@
 """Solve M a + G^T lam = r, G a = c for the accelerations a and the multipliers lam (`f`: kit, `w`: workspace).
 
-M is the mass matrix, and G contains the independent rows of the constraint Jacobian. There are three forms:
+M: mass matrix; G: independent rows of the constraint Jacobian; r: forces; c: given values of G a. Three forms exist:
 
 - NULL_SPACE, for few degrees of freedom. Let G_d and G_i be the columns of G for dependent and for independent
   coordinates. The columns of T = [I; D^T], with D^T = -G_d^-1 G_i, are the velocities that the constraints allow. The
@@ -52,7 +52,7 @@ from twoloop.kernels.linalg.markowitz_lu import solve as solve_dependent
 
 @compiled
 def find_null_space(w):
-    """Store D in w.D, except in its last row: dependent velocities are D^T times independent ones if G v = 0."""
+    """Store in w.D, but not in its last row, the matrix D: G v = 0 if dependent v are D^T times independent v."""
     rows, independent = rows_of(w.index_v), w.independent_v
     for j in range(independent.size):
         for k in range(rows.size):
@@ -62,7 +62,7 @@ def find_null_space(w):
 
 @merged
 def _reduce_diagonal_mass(columns, independent, M, D, A, m):
-    """Store the upper triangle of T^T M T in A, for a diagonal M and allowed velocities T = [I; D^T]; m: scratch."""
+    """Store in A the upper triangle of T^T M T, for a diagonal mass matrix M; columns of T = [I; D^T]: null space."""
     for k in range(columns.size):
         m[k] = M[columns[k], columns[k]]
     for i in range(independent.size):
@@ -76,7 +76,7 @@ def _reduce_diagonal_mass(columns, independent, M, D, A, m):
 
 @merged
 def _reduce_dense_mass(columns, independent, M, D, A, MT):
-    """Store the upper triangle of T^T M T in A, for any mass M and allowed velocities T = [I; D^T]; MT: scratch."""
+    """Store in A the upper triangle of T^T M T, for any mass matrix M; columns of T = [I; D^T]: null space."""
     n, n_dof = M.shape[0], independent.size
     for i in range(n):
         for j in range(n_dof):
@@ -98,7 +98,7 @@ def _reduce_dense_mass(columns, independent, M, D, A, MT):
 
 @merged
 def factor_reduced_mass(f, w):
-    """Store in w.A the L D L^T factors of T^T M T, with allowed velocities T = [I; D^T]; return a code."""
+    """Store in w.A the L D L^T factors of T^T M T (columns of T: null space of the Jacobian); return a code."""
     columns = columns_of(w.index_v)
     if f.diagonal_mass == 1:
         _reduce_diagonal_mass(columns, w.independent_v, w.M, w.D, w.A, w.x)
@@ -144,7 +144,7 @@ def solve_by_reduced_mass(f, w, r, c, a):
 
 @merged
 def multipliers_by_elimination(f, w, r, a, lam):
-    """Store the multipliers in lam, by the equations of G^T lam = r - M a that belong to dependent coordinates."""
+    """Store the multipliers in lam: solve the rows of G^T lam = r - M a that belong to dependent coordinates."""
     rows, columns, z = rows_of(w.index_v), columns_of(w.index_v), w.z
     for k in range(columns.size):
         column = columns[k]
@@ -162,7 +162,7 @@ def multipliers_by_elimination(f, w, r, a, lam):
 
 @merged
 def factor_mass(f, w):
-    """Store in w.L the factors of the mass matrix w.M, or M^-1 if M is constant and not banded; return a code."""
+    """Store in w.L the factors of the mass matrix w.M (its inverse, if M is constant, not banded); return a code."""
     if has_banded_mass(f):
         is_definite = factor_banded_mass(f, w) == DONE
     else:
@@ -201,7 +201,7 @@ def _is_equal(A, B):
 
 @merged
 def factor_schur_complement(f, w):
-    """Store in w.S the factors of S = G M^-1 G^T (G: independent rows) if G or M has changed; return a code."""
+    """Store in w.S the factors of G M^-1 G^T, if they are not those of the present M and G yet; return a code."""
     is_constant = f.constant_mass == 1
     if is_constant and _is_equal(w.G, w.G_of_S):
         return DONE
@@ -227,7 +227,7 @@ def factor_schur_complement(f, w):
 
 @merged
 def solve_by_schur_complement(f, w, r, c, a):
-    """Store accelerations in `a`, multipliers of independent rows in w.z, by w.S, the factored Schur complement."""
+    """Solve M a + G^T lam = r, G a = c by the factors in w.S of G M^-1 G^T: store accelerations in `a`, lam in w.z."""
     rows, M_inverse_G = w.rows_v, w.W
     _apply_inverse_mass(f, w, r, a)
     for i in range(rows.size):
@@ -248,7 +248,7 @@ MIN_COORDINATES = 32
 
 
 def sparse_pays(n_q: int, n_rows: int, diagonal: bool) -> bool:
-    """Return whether sparse factors (augmented form) are faster than dense ones; `diagonal`: whether M is diagonal."""
+    """Return True if sparse factors (augmented form) are faster than dense ones; `diagonal`: whether M is diagonal."""
     return n_rows >= MIN_ROWS and (n_q - n_rows >= MIN_ROWS or (n_q >= MIN_COORDINATES and not diagonal))
 
 
@@ -263,7 +263,7 @@ def _largest_entry(A):
 
 @compiled
 def _write_augmented_program(w):
-    """Store the program that factors the augmented matrix [M G^T; G 0] in w.index_a; return `choose_order`'s code."""
+    """Store in w.index_a the program that factors the augmented matrix [M G^T; G 0]; return `choose_order`'s code."""
     n, rows, index, values = w.Q.size, w.rows_v, w.index_a, w.values_a
     update_pattern(w.M, w.mass_pattern)
     clear_lists(index, n + rows.size)
@@ -286,7 +286,7 @@ def _write_augmented_program(w):
 
 @compiled
 def _run_augmented_program(w):
-    """Factor the augmented matrix in w.values_a; return False if a pivot is zero or NaN, or a multiplier too large."""
+    """Factor the augmented matrix in w.values_a; return False if a pivot is zero or NaN, or an entry of L too large."""
     index, values, scale, first_of_mass = w.index_a, w.values_a, w.mass_scale, w.entries.size
     source = index_of_entries(index[at.SIZE]) + 2 * index[at.N_SLOTS]
     for s in range(index[at.N_SLOTS]):
@@ -297,7 +297,7 @@ def _run_augmented_program(w):
 
 @compiled
 def factor_augmented(f, w):
-    """Factor the augmented matrix [M G^T; G 0]; set f.form to a dense form if factors are not sparse; return a code."""
+    """Factor the augmented matrix [M G^T; G 0], or set f.form to a dense form if it is not sparse; return a code."""
     w.n_factorizations += 1
     has_new_entry = f.constant_mass == 0 and update_pattern(w.M, w.mass_pattern)
     if w.index_a[at.SIZE] == 0 or has_new_entry or not _run_augmented_program(w):
@@ -317,7 +317,7 @@ def factor_augmented(f, w):
 
 @compiled
 def solve_augmented(w, r, c, a):
-    """Store accelerations in `a`, multipliers of independent rows in w.z, by the factors from `factor_augmented`."""
+    """Solve M a + G^T lam = r, G a = c by the factors from `factor_augmented`; store lam of independent rows in w.z."""
     n, size, scale = r.size, w.index_a[at.SIZE], w.mass_scale
     x, y = w.right[:size], w.right[size:]
     for j in range(n):
@@ -338,7 +338,7 @@ def solve_augmented(w, r, c, a):
 
 @compiled
 def _factor_augmented_or_dense(f, w):
-    """Factor the augmented matrix; if this changes f.form, store what the dense form needs in w; return a code."""
+    """Factor the augmented matrix; if its factors are not sparse, prepare the dense form instead; return a code."""
     code = factor_augmented(f, w)
     if code == DONE and f.form == NULL_SPACE:
         find_null_space(w)
@@ -349,7 +349,7 @@ def _factor_augmented_or_dense(f, w):
 
 @merged
 def factor(f, w):
-    """Factor the equations of the accelerations in the form f.form, unless w.factored is 1; return a code."""
+    """If w.factored is not 1, factor the equations of the accelerations in the form f.form; return a code."""
     if w.factored == 1.0:
         return DONE
     code = _factor_augmented_or_dense(f, w) if f.form == AUGMENTED else DONE
@@ -379,7 +379,7 @@ def solve(f, w, r, c, a):
 
 @merged
 def multipliers(f, w, r, a, lam):
-    """Store the multipliers of independent rows for `a`, the last solution, in lam; leave the other entries of lam."""
+    """Store in lam the multipliers of independent rows, after `solve` has computed `a`; other entries of lam stay."""
     if f.form == NULL_SPACE:
         multipliers_by_elimination(f, w, r, a, lam)
     else:

@@ -7,11 +7,11 @@ between the row and the span of previous rows. For a redundant row, 0 replaces 1
 the solution, and the program stays the same. If the smallest squared sine is 10^-k, solutions lose k digits, which
 iterative refinement with M and G recovers.
 
-The matrix M of a body may be singular, as it is with four Euler parameters. Then M + s g g^T replaces M for each row g
+The matrix M of a body may be singular, as it is with four Euler parameters. Then s g^T g is added to M for each row g
 of G that involves this body only; s is a positive number. Accelerations stay the same, because the constraint
 prescribes g a, but the multiplier of g decreases by s g a. So M need only be positive definite on the velocities that
-these rows allow. A row g that is redundant, as in closed loops, may be added, too. Its constraint is not part of the
-solution; so s g^T (g a), with the prescribed value of g a, is added to the right-hand side.
+these rows allow. A row g that is redundant, as in closed loops, may be added, too. Its constraint is not among the
+equations that are solved; so s g^T (g a), with the prescribed value of g a, is added to the right-hand side.
 """
 
 from twoloop.kernels.data.common import compiled, merged
@@ -26,12 +26,15 @@ from twoloop.kernels.linalg.symbolic_factorization import (
     update_runs_of,
 )
 
-NOT_DEFINITE = -1.0  # result of `factor` if a pivot of M is not positive; otherwise, the result is at least 0
+NOT_DEFINITE = -1.0  # result of `factor` if a pivot of M is not positive; a result of at least 0 means success
 
 
 @compiled
 def _fill_stiffness(program, mass, jacobian, stiffness, scratch):
-    """Store s = m / |g|^2 for rows g of G that are added to M as s g g^T; m: largest M_jj of the columns j of g."""
+    """Store in `stiffness` the number s of each row g of G that is added to a singular M as s g^T g.
+
+    s is m / |g|^2, so that s g^T g is about as large as M; m: largest M_jj of the columns j in which g has entries.
+    """
     n_q = program[N_COORDINATES]
     for k in range(program[N_PIVOTS]):
         scratch[k] = 0.0
@@ -57,9 +60,9 @@ def _fill_stiffness(program, mass, jacobian, stiffness, scratch):
 
 @merged
 def fill_saddle_matrix(program, mass, jacobian, values, stiffness, scratch):
-    """Store [M G^T; G 0] in `values`, after adding terms s g g^T to a singular M for some rows g of G.
+    """Store in `values` the matrix [M G^T; G 0] to be factored; add s g^T g to a singular M, for some rows g of G.
 
-    The numbers s are stored in `stiffness`, see `_fill_stiffness`. `scratch`: one number for each pivot.
+    The numbers s are stored in `stiffness`, see `_fill_stiffness`. `scratch` has one number for each pivot.
     """
     for s in range(values.size):
         values[s] = 0.0
@@ -82,8 +85,8 @@ def factor(program, is_independent, values, sizes, min_sine_square):
 
     The sine is that of the angle between a row of G and the span of previous rows. Its square is -pivot / (squared norm
     of the row); the squared norms are stored in `sizes`. On entry, `is_independent` is 0 for rows that count as
-    redundant. It becomes 0 for rows whose squared sine is at most `min_sine_square`. Rows with 0 do not affect the
-    result. If M is not positive definite on the velocities that the rows allow, return NOT_DEFINITE.
+    redundant. It becomes 0 for rows whose squared sine is at most `min_sine_square`. Rows with 0 are left out. If the
+    pivot of a coordinate is not positive (M is not positive definite), return NOT_DEFINITE.
     """
     (n_q, n) = program[N_COORDINATES], program[N_PIVOTS]
     order, runs = pivot_order_of(program), update_runs_of(program)
@@ -134,11 +137,11 @@ def factor(program, is_independent, values, sizes, min_sine_square):
 def solve(program, values, stiffness, x, y):
     """Replace x = [r, c] by the solution [a, lam] of M a + G^T lam = r, G a = c, using the factors `values`.
 
-    `stiffness`: the number s for each row g of G that was added to M as s g g^T. y is scratch.
+    `stiffness`: the number s for each row g of G that was added to M as s g^T g. y is scratch.
     """
     n, order, n_q = program[N_PIVOTS], pivot_order_of(program), program[N_COORDINATES]
-    # `values` are factors for M + s g g^T; so r + s c g^T should replace r. With r, accelerations are the same, because
-    # g a = c, but the multiplier of row g is too small by s c. The last loop adds s c
+    # The factors belong to M + s g^T g, but x contains r instead of r + s c g^T. This does not change accelerations,
+    # because g a = c; but the multiplier of row g becomes too small by s c, which the last loop adds
     begin, row_of = factor_columns_of(program)
     for k in range(n):
         y[k] = x[order[k]]
@@ -158,9 +161,10 @@ def solve(program, values, stiffness, x, y):
 
 @compiled
 def add_terms_of_redundant_rows(program, jacobian, is_independent, stiffness, rhs, right):
-    """For each redundant row g of G that was added to M as s g g^T, add s c g^T to `right`.
+    """Add s c g^T to `right`, a right-hand side, for each redundant row g of G that was added to M as s g^T g.
 
-    s is the row's number in `stiffness`, and c its right-hand side in `rhs`: its equation g a = c is not solved.
+    So the solution stays the same, although the equation g a = c of this row is not among those that are solved. s is
+    the row's number in `stiffness`, and c its number in `rhs`.
     """
     n_q = program[N_COORDINATES]
     _, columns, _ = jacobian_entries_of(program)
@@ -190,9 +194,9 @@ def subtract_product(program, mass, jacobian, is_independent, x, b):
 
 @compiled
 def solve_refined(program, mass, jacobian, is_independent, values, stiffness, x, n_corrections, right, residual, y):
-    """Replace x = [r, c] by the solution [a, lam] of M a + G^T lam = r, G a = c; correct it `n_corrections` times.
+    """Replace x = [r, c] by the solution [a, lam] of M a + G^T lam = r, G a = c; refine it `n_corrections` times.
 
-    Return the last correction of a, relative to max|a|; 0: no corrections. The last three arguments are scratch.
+    Return max|last correction of a| / max|a|, or 0 without corrections. The last three arguments are scratch.
     """
     n_q, change = program[N_COORDINATES], 0.0
     for k in range(x.size):

@@ -34,7 +34,7 @@ from twoloop.kernels.linalg.symbolic_factorization import (
     update_runs_of,
 )
 
-MIN_PIVOT = 1e-11  # smallest allowed pivot, relative to the sum of its |terms|; smaller ones may be rounding errors
+MIN_PIVOT = 1e-11  # `factor` fails if |pivot| is at most this fraction of the sum of all |terms| whose sum the pivot is
 
 
 def newton_program(
@@ -48,7 +48,8 @@ def newton_program(
 ) -> NDArray[np.int32] | None:
     """Return the program that factors Newton's matrix; None if the program would be too long.
 
-    `tangents`: entries of K and D (derivatives of forces), both triangles, in the order of `grouped_entries`.
+    `tangents`: entries of K and D (derivatives of forces), both triangles, in the order of `grouped_entries`. For the
+    other arguments see `factorization_program`.
     """
     groups = column_groups(tangents, n_q)[tangents[1]]
     group_begins = np.searchsorted(groups, np.arange(groups.max(initial=-1) + 2))
@@ -65,7 +66,7 @@ def grouped_entries(tangents: Entries, n_q: int) -> Entries:
 
 
 def column_groups(entries: Entries, n_q: int) -> Integers:
-    """Return the number of the group of each column (n_q); no two columns of a group have an entry in the same row."""
+    """Divide columns into groups in which no two columns have an entry in the same row; return each column's group."""
     rows_of: list[list[int]] = [[] for _ in range(n_q)]
     for i, j in zip(*(indices.tolist() for indices in entries), strict=True):
         rows_of[j].append(i)
@@ -84,8 +85,8 @@ def column_groups(entries: Entries, n_q: int) -> Integers:
 def tangent_entries_of(program):
     """Return the rows and columns of the entries of K and D, and the index of the first entry of each group of columns.
 
-    K and D are derivatives of the forces; one displacement yields all columns of a group. Behind the index of the last
-    group's first entry, the number of entries follows.
+    K and D are derivatives of the forces; one displacement yields all columns of a group. The list of indices ends with
+    the number of entries.
     """
     group_begins = program[end_of_sections(program) :]
     rows, columns, _ = mass_entries_of(program)
@@ -95,9 +96,9 @@ def tangent_entries_of(program):
 
 @compiled
 def fill_newton_matrix(program, mass, jacobian, K, D, z, stiffness, values):
-    """Store Newton's matrix [M - z^2 K - z D, G^T; G, 0] in `values`, for real or complex z.
+    """Store in `values` Newton's matrix [M - z^2 K - z D, G^T; G, 0]; z (real or complex): multiple of the step size.
 
-    `stiffness`: the number s for each row g of G that is added to a singular M as s g g^T.
+    K, D: derivatives of forces. `stiffness`: the number s of each row g of G that is added to a singular M as s g^T g.
     """
     for s in range(values.size):
         values[s] = 0.0
@@ -123,7 +124,7 @@ def fill_newton_matrix(program, mass, jacobian, K, D, z, stiffness, values):
 def factor(program, is_independent, values, sizes):
     """Replace the matrix in `values` by its factors L U, 1/pivot on the diagonal; return False if a pivot is too small.
 
-    Factors of redundant rows (0 in `is_independent`) become 0, so that solutions do not use them. `sizes` is scratch.
+    Redundant rows (0 in `is_independent`) have factors of 0, so that they do not affect solutions. `sizes` is scratch.
     """
     n_q, n, n_off = program[N_COORDINATES], program[N_PIVOTS], program[N_OFF_DIAGONAL]
     order, runs = pivot_order_of(program), update_runs_of(program)

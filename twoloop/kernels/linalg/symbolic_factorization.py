@@ -69,8 +69,8 @@ class _PartSupports:
         """Return True if a joint may be eliminated before the remaining hubs (bodies with many joints).
 
         A part is a set of bodies that eliminated joints connect; the ground or hubs support it. The joint may be
-        eliminated if it involves no hub, directly or as a support of its parts. It may also be eliminated if one of its
-        parts has no support, unless it involves one of the `lone_bodies`.
+        eliminated if neither it nor the supports of the parts that it connects involve a hub. It may also be eliminated
+        if one of these parts has no support, unless the joint involves one of the `lone_bodies`.
         """
         bodies = self.joints[joint]
         parts = {self.parts.find(body) for body in bodies if body not in self.hubs}
@@ -254,19 +254,18 @@ Entries = tuple[Integers, Integers]  # row indices and column indices of the non
 
 # indices of the sizes at the beginning of a program; functions at the end of this module return its later sections
 (
-    N_COORDINATES,  # n_q
-    N_PIVOTS,  # number of coordinates and rows
+    N_COORDINATES,  # number of coordinates
+    N_PIVOTS,  # number of pivots: coordinates plus rows of G
     N_OFF_DIAGONAL,  # number of entries of L below the diagonal
     N_UPDATES,  # number of updates in the elimination, each a multiplication and a subtraction
-    N_RUNS,  # length of the section that `update_runs_of` returns
-    N_OF_MASS,  # number of entries of M
-    N_OF_JACOBIAN,  # number of entries of G
-    N_STIFFENED,  # number of products of two entries in a row of G, which are added to a singular M
+    N_RUNS,  # length of the list from `update_runs_of`: two numbers for each range of updates
+    N_OF_MASS,  # number of listed entries of the mass matrix M
+    N_OF_JACOBIAN,  # number of listed entries of the constraint Jacobian G
+    N_STIFFENED,  # number of products g_i g_j in the terms s g^T g (g: row of G) that are added to a singular M
     N_HEAD,
 ) = range(9)
 ALWAYS_ALLOWED_UPDATES = 3_000_000  # a program is always written if it has at most this number of updates
-# a longer program for n pivots is written if it has at most MAX_UPDATE_RATIO * n^3 updates; else dense factors are used
-MAX_UPDATE_RATIO = 1e-3
+MAX_UPDATE_RATIO = 1e-3  # a longer program for n pivots is written only if it has at most this times n^3 updates
 MAX_UPDATES = 30_000_000  # largest number of updates of a program; writing a longer program takes too much memory
 
 
@@ -282,7 +281,7 @@ def factorization_program(
 
     mass, jacobian : entries of M, both triangles, and of G. If an entry is listed repeatedly, its values are added.
     body_groups : groups of coordinates that form one body each, even if M does not couple them.
-    stiff_rows : rows g of G that are added to M as s g g^T, because M is singular; M must have the entries of g g^T.
+    stiff_rows : rows g of G that are added to M as s g^T g, because M is singular; M must have the entries of g^T g.
     """
     order = elimination_order(n_q, n_rows, mass, jacobian, body_groups, stiff_rows)
     return program_in_order(order, n_q, mass, jacobian, stiff_rows)
@@ -308,7 +307,7 @@ def program_in_order(
     begin = np.concatenate([[0], np.cumsum(sizes)])
     row_of = np.concatenate([np.zeros(0, np.int64), *rows_below])
     column_of = np.repeat(np.arange(n), sizes)
-    entry_keys = column_of * n + row_of  # one number for each entry of L, in ascending order
+    entry_keys = column_of * n + row_of  # ascending numbers that identify the entries of L, searched by `slots_of`
 
     def slots_of(column: Integers, row: Integers) -> Integers:
         off_diagonal_slots = n + np.searchsorted(entry_keys, column * n + row)
@@ -338,11 +337,11 @@ def program_in_order(
 
 
 def _update_runs(targets: Integers, diagonal: NDArray[np.bool_]) -> Integers:
-    """Divide the updates of off-diagonal entries into ranges; return the length and the first target of each range.
+    """Divide the elimination's updates of off-diagonal entries into ranges that change adjacent entries.
 
-    A target is the index of the entry that an update changes; within a range, targets are consecutive integers. Ranges
-    are long, because the rows of a joint are adjacent in all columns. So numbers are read and written as vectors, and
-    the program is a tenth as long as a list of all targets.
+    `targets`: for each update, the index of the entry that it changes; `diagonal`: whether this entry is on the
+    diagonal. Return the length of each range and the index of the first entry that it changes. Ranges are long, as the
+    rows of a joint are adjacent in all columns: the processor changes vectors, and programs are a tenth as long.
     """
     off_diagonal = np.flatnonzero(~diagonal)
     begins = np.flatnonzero(diagonal[off_diagonal - 1] | (targets[off_diagonal] != targets[off_diagonal - 1] + 1))
@@ -351,7 +350,7 @@ def _update_runs(targets: Integers, diagonal: NDArray[np.bool_]) -> Integers:
 
 
 def _products_of_entries(rows: Integers, chosen: Sequence[int]) -> tuple[Integers, Integers, Integers]:
-    """List all products of two entries of a row, for each row in `chosen`: the row, and the indices of both entries."""
+    """List the pairs of entries whose products form g^T g, for each row g in `chosen`: row, indices of both entries."""
     parts: list[tuple[Integers, Integers, Integers]] = [(rows[:0], rows[:0], rows[:0])]
     sequence = np.argsort(rows, kind="stable")
     sorted_rows = rows[sequence]
@@ -376,8 +375,8 @@ def _index_pairs(m: int) -> Entries:
 def _columns_of_factors(n: int, low: Integers, high: Integers) -> list[Integers]:
     """Return, for each column of L, the rows that have an entry below the diagonal, including fill-in.
 
-    The entries of the matrix are in columns `low` and rows `high`. If i is the first of the rows in a column of L, the
-    elimination of this column adds the other rows to column i.
+    `low`, `high`: columns and rows of the matrix entries. If i is the first of the rows in a column of L, the
+    elimination of this column causes entries in column i, in the other rows.
     """
     rows_below: list[set[int]] = [set() for _ in range(n)]
     for column, row in zip(low.tolist(), high.tolist(), strict=True):
@@ -408,7 +407,7 @@ def pivot_order_of(program):
 
 @inlined
 def factor_columns_of(program):
-    """Return where each column of L begins, then the end of the last; and the row of each entry, as a pivot number."""
+    """Return two lists: where each column of L begins, then the number of its entries; and the row of each entry."""
     begin = N_HEAD + program[N_PIVOTS]
     middle = begin + program[N_PIVOTS] + 1
     return program[begin:middle], program[middle : middle + program[N_OFF_DIAGONAL]]
@@ -416,7 +415,7 @@ def factor_columns_of(program):
 
 @inlined
 def update_runs_of(program):
-    """Return length and first target of each range of updates, see `_update_runs`, in the order of elimination."""
+    """Return the ranges of an elimination's updates: length of each, and index of the first entry that it changes."""
     begin = N_HEAD + 2 * program[N_PIVOTS] + 1 + program[N_OFF_DIAGONAL]
     return program[begin : begin + program[N_RUNS]]
 
@@ -439,7 +438,10 @@ def jacobian_entries_of(program):
 
 @inlined
 def stiffening_products_of(program):
-    """Return, for each product of two entries of G that is added to M: row, both entries, index in the factors."""
+    """Return four lists of the products g_i g_j in s g^T g, which is added to a singular M for some rows g of G.
+
+    For each product: its row; the indices of both entries; the index, in the factors, of the entry of M to add it to.
+    """
     n = program[N_STIFFENED]
     begin = N_HEAD + 2 * program[N_PIVOTS] + 1 + program[N_OFF_DIAGONAL] + program[N_RUNS]
     begin += 3 * (program[N_OF_MASS] + program[N_OF_JACOBIAN])
