@@ -1,7 +1,7 @@
-"""Write the program for the Taylor series of a mechanism's motion.
+"""Make the program (list of operations) that taylor_step.py repeats to compute Taylor series of a mechanism's motion.
 
 The motion satisfies G v + (C_t, b) = 0 and M a + G^T lam = Q. G = [C_q; A] are the rows of all constraints, C_t
-and b the parts of their rates that do not depend on v, and lam the multipliers. taylor_step.py solves these equations.
+and b the parts of their rates that do not depend on v, and lam the multipliers.
 
 An operation is "early" if it depends on time and coordinates only, as for G and M, and "late" if it depends on
 velocities, too. In G v and G^T lam + M a, terms that share a factor become one product.
@@ -25,32 +25,32 @@ from twoloop.problem.system import ConstrainedSystem
 Integers = NDArray[np.int64]
 Array = NDArray[np.float64]
 
-# if M, C_q and A have more entries than this, series are traced only if the user chooses the method Taylor
+# if M, C_q and A have more entries than this, single runs use Taylor series only if the user chooses them
 MAX_ENTRIES = 200_000
 
-# callbacks from which a series is derived
+# callbacks that series are derived from: M, Q, C_q, A, C_t, b
 USED_CALLBACKS = ("mass", "force", "jacobian", "nonholonomic", "constraint_rate", "nonholonomic_rate")
 
 
 class Sums(NamedTuple):
-    """List of affine expressions as arrays: constant and first term of each expression; all further terms."""
+    """List of affine expressions (a constant, and terms "coefficient times quantity") as arrays."""
 
-    column: Integers  # index of the quantity in the first term of each expression
-    coefficient: Array  # coefficient of the first term of each expression
-    constant: Array
-    row: Integers  # for each further term, the index of its expression
-    further_column: Integers  # for each further term, the index of its quantity
-    further_coefficient: Array
+    column: Integers  # for each expression, the index of the quantity in its first term
+    coefficient: Array  # for each expression, the coefficient of its first term
+    constant: Array  # for each expression, its constant
+    row: Integers  # for each term that is not the first, the index of its expression, or of the equation it belongs to
+    further_column: Integers  # for each such term, the index of its quantity
+    further_coefficient: Array  # for each such term, its coefficient
 
 
 @dataclass(frozen=True)
 class OperationGroups:
     """Operations in groups, in the order of their computation; their results are consecutive quantities.
 
-    groups : array with a row for each group: operations of one kind that do not need the results of each other. A row:
-        the kind, then begin and end of three ranges: of the operations; of their further terms in `first` (see `Sums`);
-        of their further terms in `second`. Sines are in a group with the cosines of the same angles. The last group is
-        products whose second factor depends on a, lam or v, which linear equations determine in each order.
+    groups : array with a row for each group. A group has operations of one kind, such as SINE, that do not need the
+        results of each other. A row contains this kind, then begin and end of three ranges: of the operations, of their
+        terms in the further_... arrays of `first`, and of those in `second`. Sines and the cosines of the same angles
+        are one group. The last group has the products of M, G with a, lam, v, the unknowns in each order of the series.
     first, second : first and second argument of each operation.
     """
 
@@ -63,10 +63,10 @@ class OperationGroups:
 class SeriesProgram:
     """Program of a Taylor series; its quantities are t, q, v, a, lam, results of `early` and of `late`, in this order.
 
-    early : operations on quantities that depend on t and q only; after them, the products of entries of G with v.
-    late : operations on quantities that depend on v, too; after them, the products of G^T lam + M a.
-    rows, row_indices : G v + (C_t, b) without terms of the form "constant times v_i": nonzero rows, and their indices.
-    balance, balance_indices : likewise Q - G^T lam - M a, without terms "constant times lam_i" or "constant times a_i".
+    early : operations that depend on t and q only; after them, the products in G v.
+    late : operations that depend on v, too; after them, the products in G^T lam + M a.
+    rows, row_indices : nonzero rows of G v + (C_t, b), without terms that have constant entries of G; their indices.
+    balance, balance_indices : likewise Q - G^T lam - M a, without terms that have constant entries of G or M.
     traced : traces of the callbacks, to be compared with calls; None: no comparison.
     """
 
@@ -109,19 +109,19 @@ class SeriesProgram:
 
     @property
     def n_nodes(self) -> int:
-        """Return the number of quantities."""
+        """Return the number of quantities: t, q, v, a, lam, and a result of each operation."""
         return 1 + 3 * self.n_q + self.n_rows + self.n_operations
 
 
 def is_quick_to_trace(system: ConstrainedSystem) -> bool:
-    """Return whether M, C_q and A have so few entries, zeros included, that tracing a series takes about a second."""
+    """Return whether M, C_q and A are so small that tracing a series takes at most about a second."""
     return system.n_q * (system.n_q + system.n_c + system.n_a) <= MAX_ENTRIES
 
 
 def series_for(system: ConstrainedSystem, check: Check = accept_traces) -> SeriesProgram:
     """Return the cached series program of a system; `check` compares traces of callbacks with calls.
 
-    Raise Untraceable if `check` finds a difference, and in the same cases as `series_program`.
+    Raise Untraceable if `check` finds a difference, or if a callback cannot be traced.
     """
 
     def trace_series(cache: TraceCache) -> SeriesProgram:
@@ -136,8 +136,8 @@ def series_program(
 ) -> SeriesProgram:
     """Trace the callbacks of a system; return the program that computes the Taylor series of its motion.
 
-    `equations`: earlier traces, to whose graph operations are added; None: trace the callbacks now. `independent`:
-    indices of the constraints (rows of G) that the program contains; None: all rows.
+    `equations`: earlier traces, whose graph is extended; None: trace the callbacks now. `independent`: indices of the
+    independent constraints (rows of G), to which the program is limited; None: all rows.
     Raise Untraceable if a callback cannot be traced; the message names the callback and the reason.
     """
     equations = Equations(system) if equations is None else equations
@@ -167,7 +167,7 @@ def series_program(
 
 
 def _find_sums(graph: Graph) -> dict[int, Affine]:
-    """Return, for each quantity that is a sum, its terms; these replace it in expressions. Sums need no operation."""
+    """Return the affine expression of each quantity that is a sum: it replaces the quantity in other expressions."""
     sums: dict[int, Affine] = {}
     for i, operation in enumerate(graph.operations):
         if operation is not None and operation[0] == SUM:
@@ -176,7 +176,7 @@ def _find_sums(graph: Graph) -> dict[int, Affine]:
 
 
 def _expand_sums(sums: dict[int, Affine], expr: Affine) -> Affine:
-    """Return `expr` with each quantity that is a sum replaced by the terms of this sum; `sums`: see `_find_sums`."""
+    """Replace each quantity in `expr` that is a sum by the terms of this sum; return the new expression."""
     sum_quantities = [i for i in expr.terms if i in sums]
     if not sum_quantities:
         return expr
@@ -196,9 +196,9 @@ def _sum_of_products(
 ) -> Affine:
     """Return rest + sum_i factors[i] multipliers[i], with few products; new products are added to the dict `products`.
 
-    Way 1: terms with equal factors share a product. Way 2: each factor is split into its quantities, and terms with the
-    same quantity share a product. The way with fewer new products is taken; if both have as many, way 2 if `of_rates`
-    (for a row of G v + (C_t, b)), else way 1. Way 2 may yield (cos x) x', known from sin x, see lane_series.py.
+    There are two ways: (1) terms with equal factors share a product; (2) each factor is split into its quantities, and
+    terms with the same quantity share a product. The way with fewer new products is taken. If both have as many, it is
+    (2) if `of_rates` (for G v + (C_t, b)), else (1): (2) may yield (cos x) x', which costs nothing, see lane_series.py.
     """
     total = rest
     by_factor: dict[Any, tuple[Affine, Affine]] = {}
@@ -225,9 +225,9 @@ def _sum_of_products(
 
 
 def _normalized_product(factor: Affine, multiplier: Affine) -> tuple[Any, float, Affine, Affine]:
-    """Write factor * multiplier as scale * first * second; return (key, scale, first, second).
+    """Write factor * multiplier as scale * first * second, where scale is a number; return (key, scale, first, second).
 
-    Products that differ only by a constant factor have equal keys (for a dict), so that one operation computes them.
+    Products that differ only by the number `scale` have equal keys, so that one operation computes them.
     """
     scale, multiplier = multiplier.normalized()
     return (factor.key, multiplier.key), scale, factor, multiplier
@@ -249,7 +249,7 @@ def _assemble_program(
     row_products: dict[Any, Any],
     reaction_products: dict[Any, Any],
 ) -> SeriesProgram:
-    """Return the SeriesProgram of two systems, G v + (C_t, b) = 0 (`rows`) and Q - G^T lam - M a = 0 (`balance`)."""
+    """Return the SeriesProgram of the equations G v + (C_t, b) = 0 (`rows`) and Q - G^T lam - M a = 0 (`balance`)."""
     early: list[Any] = []
     late: list[Any] = []
     factors = [expr for group in (row_products, reaction_products) for _, *exprs in group.values() for expr in exprs]
@@ -296,7 +296,7 @@ def _needed_operations(graph: Graph, exprs: list[Affine]) -> list[tuple[int, Any
 
 
 def _nonzero_sums(exprs: list[Affine], nodes: dict[int, int]) -> tuple[Sums, Integers]:
-    """Return the nonzero expressions as Sums, and their indices in `exprs`; `nodes`: program index of each quantity."""
+    """Return the nonzero expressions as Sums, and their indices in `exprs`, with which Sums.row is renumbered."""
     indices = [k for k, expr in enumerate(exprs) if expr.terms or expr.constant]
     sums = _convert_to_sums([exprs[k] for k in indices], nodes)
     index_array = np.array(indices, dtype=np.int64)
@@ -309,11 +309,11 @@ def _remove_terms(expr: Affine, inputs: Container[int]) -> Affine:
 
 
 def _grouped_operations(operations: list[Any]) -> list[tuple[int, list[Any]]]:
-    """Return groups of operations of one kind, as (kind, operations); a group depends only on previous groups."""
+    """Sort operations into groups of one kind, which depend on earlier groups only; return (kind, operations) each."""
     nodes = {node for node, *_ in operations}
     levels: dict[int, int] = {}
     groups: dict[tuple[int, int], list[Any]] = {}
-    for node, kind, first, second in operations:  # arguments come before the operations that use them
+    for node, kind, first, second in operations:  # an operation comes after those that compute its arguments
         arguments = [i for expr in (first, second) if expr is not None for i in expr.terms if i in nodes]
         levels[node] = 1 + max((levels[i] for i in arguments), default=0)
         if second is None:
@@ -337,7 +337,7 @@ def _term_counts(operation: tuple[int, Affine, Affine]) -> tuple[int, int]:
 
 
 def _make_groups(groups: list[tuple[int, list[Any]]], nodes: dict[int, int]) -> OperationGroups:
-    """Return groups (kind, operations) as OperationGroups; `nodes`: index of each quantity in the SeriesProgram."""
+    """Convert groups (kind, operations) to OperationGroups; `nodes`: index, in the program, of each quantity."""
     members = [member for _, group in groups for member in group]
     sums = [_convert_to_sums([member[k] for member in members], nodes) for k in (1, 2)]
     rows, begin = [], 0
@@ -350,7 +350,7 @@ def _make_groups(groups: list[tuple[int, list[Any]]], nodes: dict[int, int]) -> 
 
 
 def _convert_to_sums(exprs: list[Affine], nodes: dict[int, int]) -> Sums:
-    """Return expressions as Sums; `nodes`: index of each quantity of the graph in the SeriesProgram."""
+    """Convert a list of expressions to Sums; `nodes`: index, in the program, of each quantity of the graph."""
     terms = [[(nodes[i], c) for i, c in expr.terms.items()] or [(0, 0.0)] for expr in exprs]
     further_terms = [(k, *term) for k, form_terms in enumerate(terms) for term in form_terms[1:]]
     return Sums(

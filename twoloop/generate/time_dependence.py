@@ -1,4 +1,8 @@
-"""Decide from traces whether forces or drives may act for a short time, or vary much over a short distance."""
+"""Decide from traces whether forces or drives may act for a short time, or vary much over a short distance.
+
+The formulas of the callbacks decide. A *short pulse* is a large value only in a short range of t, or of q or v, such as
+that of 1 / (1 + x^4) or of a high power of a sine. Evaluations at the steps of a run may miss it.
+"""
 
 import math
 from collections.abc import Callable, Iterable, Mapping
@@ -24,17 +28,17 @@ from twoloop.kernels.evaluation.operations import (
 from twoloop.problem.system import ConstrainedSystem
 
 TIME_CALLBACKS = ("force", "constraint_rate", "nonholonomic_rate")  # callbacks whose dependence on time is analysed
-# callbacks whose dependence on the state is analysed
+# callbacks whose dependence on q and v is analysed
 STATE_CALLBACKS = ("force", "mass", "constraint", "jacobian", "nonholonomic")
-SMOOTH_OPERATIONS = (PRODUCT, SUM, SINE, COSINE)  # polynomials of these have no short pulses up to MAX_DEGREE
+SMOOTH_OPERATIONS = (PRODUCT, SUM, SINE, COSINE)  # functions of time by other operations may have short pulses
 MAX_DEGREE = 8  # polynomials in time, or in sines and cosines, of a higher degree may have short pulses
 MAX_DEGREE_OF_STATE = 32  # polynomials in q and v of a higher degree, and their roots, may have short pulses
-MAX_DEGREE_OF_DIVISOR = 4  # a quotient may have short pulses if its divisors have a higher total degree in q, v
+MAX_DEGREE_OF_DIVISOR = 4  # a quotient may have short pulses if its divisors have a higher total degree in q and v
 FASTEST_DECAY = -2.0  # a quantity may have short pulses if it decays as x^p with p below this value, like 1 / (1 + x^4)
-MAX_RATE = 4.0  # a sine is steep if the derivative of its argument by a coordinate or velocity is larger than this
+MAX_RATE = 4.0  # a force may be steep if it has a sine or cosine of x, and dx/dq or dx/dv is larger than this
 # systems with more coordinates are not traced for this analysis: that may take ten times as long as sampling the forces
 MAX_COORDINATES = 300
-TIME_MASK = 1  # bit mask of t, the first input of a graph
+TIME_MASK = 1  # a quantity depends on t (input 0 of the graph) if this bit is 1 in its entry of `Graph.input_masks`
 
 
 class ShortForces(NamedTuple):
@@ -45,19 +49,19 @@ class ShortForces(NamedTuple):
 
 
 class Dependence(NamedTuple):
-    """Result of the analysis of a system's callbacks; all systems with the same TraceCache share it."""
+    """Result of the analysis of a system's callbacks; systems that differ only in parameters share it."""
 
     short_forces: ShortForces
-    is_steep: bool  # whether forces or drives may be steep, see `forces_may_be_steep`
+    is_steep: bool  # whether forces or drives may vary much over a distance shorter than a step
     kinds: frozenset[str]  # kinds of callbacks that were traced
 
     def specialize(self, system: ConstrainedSystem, evaluate: Evaluator) -> "Dependence":
-        """Return this object: all systems with the same TraceCache have the same result."""
+        """Return this object: the result does not depend on parameters."""
         return self
 
 
 def find_short_forces(system: ConstrainedSystem, force_was_traced: bool) -> ShortForces:
-    """Return whether callbacks of a system may have short pulses, see ShortForces.
+    """Return whether forces or drives of a system may have short pulses as functions of time, and of the state.
 
     If callbacks cannot be traced, `by_time` and `by_state` are True. Systems with more than MAX_COORDINATES coordinates
     are not traced; then `by_time` is True, and `by_state` is False. Callbacks that are called in Python may store their
@@ -70,11 +74,10 @@ def find_short_forces(system: ConstrainedSystem, force_was_traced: bool) -> Shor
 
 
 def forces_may_be_steep(system: ConstrainedSystem, force_was_traced: bool) -> bool:
-    """Return whether forces may act for a short time, or vary much over a distance shorter than a step.
+    """Return whether forces or drives may act for a short time, or vary much over a distance shorter than a step.
 
-    This is possible for quotients and roots: a long step might evaluate the force 1 / (1 + (x / w)**2) on both sides of
-    its peak only. It might also evaluate a fast vibration at nearly equal phases. `force_was_traced`: see
-    `find_short_forces`.
+    Then long steps are not safe: a step might evaluate the force 1 / (1 + (x / w)**2) on both sides of its peak only,
+    or a fast vibration at nearly equal phases. `force_was_traced`: see `find_short_forces`.
     """
     if any(find_short_forces(system, force_was_traced)):
         return True
@@ -83,7 +86,7 @@ def forces_may_be_steep(system: ConstrainedSystem, force_was_traced: bool) -> bo
 
 
 def _dependence(system: ConstrainedSystem, force_was_traced: bool) -> Dependence | None:
-    """Return the cached analysis of a system; None if callbacks cannot be traced, or might store symbols."""
+    """Return the analysis of a system from the cache, or make it; None if callbacks cannot or must not be traced."""
     if system.called_in_python and not force_was_traced:
         return None
     try:
@@ -111,7 +114,7 @@ def _make_analysis(system: ConstrainedSystem) -> Any:
 
 
 class DegreeAlgebra(Algebra[float]):
-    """Algebra of degrees: a value is a quantity's degree as a polynomial in `inputs`; sin x, 1 / x, ... count as x."""
+    """Algebra whose values are degrees of quantities as polynomials in `inputs`; sin x, 1 / x, ... count as x."""
 
     functions: Mapping[int, Callable[[float], float]] = MappingProxyType(
         {
@@ -125,16 +128,16 @@ class DegreeAlgebra(Algebra[float]):
         self.values = dict.fromkeys(inputs, 1.0)
 
     def affine(self, expr: Affine) -> float:
-        """Return the degree of an affine expression, which is the largest degree of its terms."""
+        """Return the largest degree of the terms of an affine expression."""
         return max((self.values.get(i, 0.0) for i in expr.terms), default=0.0)
 
     def product(self, a: float, b: float) -> float:
-        """Return the degree of a product of factors of degrees a and b."""
+        """Return the degree of a product, given the degrees a and b of its factors."""
         return a + b
 
 
 class TrigonometricDegrees(DegreeAlgebra):
-    """Algebra of degrees as polynomials in sines and cosines: a high power of a sine consists of short pulses."""
+    """Algebra whose values are degrees as polynomials in sines, cosines: high powers of a sine have short pulses."""
 
     functions = MappingProxyType(
         {**DegreeAlgebra.functions, **dict.fromkeys((SINE, COSINE), lambda degree: max(degree, 1.0))}
@@ -142,7 +145,7 @@ class TrigonometricDegrees(DegreeAlgebra):
 
 
 class GrowthExponents(DegreeAlgebra):
-    """Algebra of growth: a value is the exponent p with which a quantity grows, like x^p, for large inputs x."""
+    """Algebra whose values are exponents p: for large values x of an input, the quantity grows like x^p."""
 
     functions = MappingProxyType(
         {**DegreeAlgebra.functions, RECIPROCAL: lambda p: -p, **dict.fromkeys((SINE, COSINE), lambda p: 0.0)}
@@ -150,7 +153,7 @@ class GrowthExponents(DegreeAlgebra):
 
 
 class DivisorDegrees(DegreeAlgebra):
-    """Algebra of divisors: the value of a quantity is the sum of the degrees of all divisors in its formula.
+    """Algebra whose values are total degrees of divisors: a product has the sum, an affine expression the largest.
 
     `degrees`: degrees of all quantities. Arguments of arctangents count, too: derivatives of arctangents are quotients.
     """
@@ -160,20 +163,19 @@ class DivisorDegrees(DegreeAlgebra):
         self._degrees = degrees
 
     def operation(self, kind: int, first: Affine, second: Affine | None) -> float:
-        """Return the sum of the degrees, as polynomials in `inputs`, of all divisors in an operation's formula."""
+        """Return the total degree of the divisors in the result of an operation."""
         degree = super().operation(kind, first, second)
         return degree + self._degrees.affine(first) if kind in (RECIPROCAL, ARCTANGENT) else degree
 
 
 class DerivativeBounds(DegreeAlgebra):
-    """Algebra of rates: a value is a rough bound of the derivatives of a quantity with respect to t, q and v.
+    """Algebra whose values are rough bounds of the derivatives of quantities with respect to t, q and v.
 
-    Factors of products are assumed to be at most 1. If a coefficient depends on parameters, which may have any values,
-    the bound is infinite.
+    Factors of products are assumed to be at most 1. A coefficient that depends on parameters makes the bound infinite.
     """
 
     def affine(self, expr: Affine) -> float:
-        """Return the bound for an affine expression: the largest bound of its terms."""
+        """Return the largest bound of the terms of an affine expression."""
         return max(
             (math.inf if type(c) is Parameter else abs(c) * self.values.get(i, 1.0) for i, c in expr.terms.items()),
             default=0.0,
@@ -183,7 +185,7 @@ class DerivativeBounds(DegreeAlgebra):
 def _has_time_pulses(graph: Graph, quantities: list[int]) -> bool:
     """Return whether one of the `quantities` may have short pulses as a function of time."""
     dependent = [i for i in quantities if graph.input_masks[i] & TIME_MASK]
-    degrees = DegreeAlgebra([0])  # degrees of quantities as polynomials in time, or in sines and cosines of time
+    degrees = DegreeAlgebra([0])  # degrees as polynomials in input 0 (time), or in its sines and cosines
     degrees.run(graph, dependent)
     return any(graph.kind(i) not in SMOOTH_OPERATIONS or degrees.values[i] > MAX_DEGREE for i in dependent)
 

@@ -5,8 +5,8 @@ raises an exception if it is called with a symbol; the message names the functio
 exception is not traced, either. Differences that tracing cannot detect, such as a changed global variable, are found by
 comparing numbers (`traced_values.py`).
 
-`Equations` returns the result of every callback of one system as an array of expressions. If a callback is missing,
-exact derivatives replace its result. Series, eliminations, references and derived callbacks are generated from these.
+`Equations` returns the result of every callback of one system as an array of expressions. Without a callback for C_q or
+gamma, the results are exact derivatives. Series, eliminations, references and derived callbacks are made from these.
 
 `TraceCache` stores traces for all systems that share their callbacks: coefficients are expressions in the parameters.
 
@@ -47,7 +47,7 @@ from twoloop.kernels.compile.dependencies import FunctionCopier, is_library
 from twoloop.kernels.compile.linking import Dispatcher
 from twoloop.problem.system import ConstrainedSystem
 
-# functions of NumPy that handle arrays of expressions like arrays of numbers
+# functions of NumPy that callbacks may call on symbols: they handle arrays of expressions like arrays of numbers
 NUMPY_FUNCTIONS = {
     *("add", "append", "atleast_1d", "atleast_2d", "block", "column_stack", "concatenate", "copy", "cross", "diag"),
     *("diagonal", "divide", "dot", "einsum", "expand_dims", "flip", "hstack", "inner", "kron", "matmul", "mean"),
@@ -55,7 +55,7 @@ NUMPY_FUNCTIONS = {
     *("size", "square", "squeeze", "stack", "subtract", "sum", "tile", "trace", "transpose", "true_divide", "vdot"),
     *("vstack", "zeros_like", "ones_like", "empty_like", "full_like"),
 }
-# functions of NumPy that are replaced during tracing: the substitutes return arrays that can contain expressions
+# functions of NumPy that are replaced while callbacks are traced, so that the arrays can contain expressions
 ARRAY_CONSTRUCTORS = ("zeros", "ones", "empty")
 ARRAY_CONVERSIONS = ("array", "asarray", "ascontiguousarray")
 
@@ -63,7 +63,7 @@ ARRAY_CONVERSIONS = ("array", "asarray", "ascontiguousarray")
 def trace(function: Callable[..., Any], t: Affine, *arguments: Any) -> Any:
     """Run a callback in Python on symbols and return what it returns.
 
-    A compiled callback writes its result to an array in `arguments` instead. Raise Untraceable if the callback does not
+    A compiled callback writes its results to arrays in `arguments` instead. Raise Untraceable if the callback does not
     run on symbols, or may treat symbols differently from numbers; the message says why.
     """
     graph, value = t.graph, None
@@ -81,7 +81,7 @@ def trace(function: Callable[..., Any], t: Affine, *arguments: Any) -> Any:
 
 
 def convert_to_expressions(graph: Graph, values: Any) -> Any:
-    """Replace the entries of an array, which a callback filled or returned, by expressions; return the array."""
+    """Convert the entries of an array, which a callback filled or returned, to expressions in place; return it."""
     for index in np.ndindex(values.shape):
         entry = values[index]
         if type(entry) is not Affine:
@@ -95,13 +95,13 @@ def convert_to_expressions(graph: Graph, values: Any) -> Any:
 
 
 class _CallbackCopier(FunctionCopier):
-    """Copier of callbacks: a copy calls symbolic substitutes (`_Mathematics`) for functions of `math` and `numpy`."""
+    """Copier of callbacks for a trace: copies call the functions of `_Mathematics` instead of `math` and `numpy`."""
 
     def is_copied(self, value: Any) -> bool:
         return isinstance(value, Dispatcher | types.FunctionType)
 
     def callback(self, function: Any) -> Any:
-        """Return a copy of a callback, which may be an object with a method `__call__`."""
+        """Return a copy of a callback: a function, or an object with a method `__call__`."""
         method = next((vars(each)["__call__"] for each in type(function).__mro__ if "__call__" in vars(each)), None)
         if isinstance(method, types.FunctionType) and not isinstance(function, Dispatcher):
             return types.MethodType(self.replacement_of(method), function)
@@ -158,7 +158,7 @@ def _refuse_symbols(value: Any, verb: str) -> None:
 
 
 def _numeric_function(function_of_numbers: Any, name: str) -> Callable[..., Any]:
-    """Return `function_of_numbers` (`name` in messages) with a check that refuses symbols as its arguments."""
+    """Return a copy of a function that refuses symbols as arguments; `name`: name of the function in the message."""
 
     @functools.wraps(function_of_numbers)
     def call_with_numbers(*arguments: Any, **options: Any) -> Any:
@@ -169,7 +169,7 @@ def _numeric_function(function_of_numbers: Any, name: str) -> Callable[..., Any]
 
 
 def _number_or_symbol(numeric: Any, symbolic: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a function that calls `symbolic` if an argument is or contains a symbol, else `numeric`."""
+    """Return a function that calls `symbolic` for symbols and entries of arrays of symbols, `numeric` for numbers."""
 
     def call_matching(*arguments: Any) -> Any:
         if _first_symbol(arguments) is None:
@@ -187,7 +187,7 @@ def _is_real_dtype(dtype: Any) -> bool:
 
 
 def _symbolic_constructor(constructor: Any) -> Callable[..., Any]:
-    """Return a substitute for `zeros`, `ones` or `empty` that returns arrays which can contain expressions."""
+    """Return a substitute for `zeros`, `ones` or `empty`, whose arrays can contain expressions."""
 
     def construct(shape: Any, dtype: Any = None, **options: Any) -> Any:
         if not _is_real_dtype(dtype):
@@ -260,20 +260,20 @@ class _Mathematics:
         return _numeric_function(original, f"{self._module.__name__}.{name}")
 
 
-# order in which callbacks are traced
+# order in which `Equations.trace_all` traces callbacks
 TRACING_ORDER = (
     *("constraint", "constraint_rate", "jacobian", "nonholonomic", "nonholonomic_rate", "mass", "force"),
     *("gamma", "nonholonomic_gamma"),
 )
-# keys: callbacks that compute gamma; values: callbacks for C_q and C_t, or A and b, whose derivatives also yield gamma
+# keys: callbacks for gamma; values: callbacks from whose derivatives it also follows (C_q and C_t; A and b)
 GAMMA_SOURCES = {"gamma": ("jacobian", "constraint_rate"), "nonholonomic_gamma": ("nonholonomic", "nonholonomic_rate")}
 
 
 class Equations:
-    """Traced callbacks of a system; each callback is traced once, when its trace is first used.
+    """Results of the callbacks of a system as expressions; each callback is traced when its result is first used.
 
     parameters : numbers or Parameters that callbacks get as parameters; None: the parameters of the system.
-    graph (field) : graph of the traces; its first inputs are t, q and v.
+    graph (field) : graph with the recorded operations of all callbacks; its first inputs are t, q and v.
     """
 
     def __init__(self, system: ConstrainedSystem, parameters: Any = None):
@@ -285,18 +285,18 @@ class Equations:
         (self.t,) = self.graph.inputs(1, False)
         self.q, self.v = self.graph.inputs(system.n_q, False), self.graph.inputs(system.n_q, True)
         self._expressions: dict[str, Any] = {}
-        self._results_before_copy: dict[str, Any] = {}  # results of callbacks that were traced before copying
+        self._results_before_copy: dict[str, Any] = {}  # in a copy: results of callbacks that the original has traced
 
     def trace_all(self) -> "Equations":
-        """Trace all callbacks of the system that can be traced, so that copies share the results; return self."""
+        """Trace all callbacks of the system that can be traced, so that copies need not trace them; return self."""
         for kind in TRACING_ORDER:
             if not self._is_derived(kind):
-                with suppress(Untraceable):  # `expressions` raises it again if the callback is needed
+                with suppress(Untraceable):  # if a callback is needed, `expressions` raises Untraceable again
                     self.expressions(kind)
         return self
 
     def copy(self) -> "Equations":
-        """Return a copy with a copy of the graph; the copy does not trace again what has been traced so far."""
+        """Return a copy with its own graph, which may be extended; it uses the traces of this object."""
         equations = copy.copy(self)
         equations.graph = self.graph.copy()
         equations.t, equations.q, equations.v = (
@@ -307,10 +307,10 @@ class Equations:
         return equations
 
     def expressions(self, kind: str, v: Sequence[Affine] | None = None) -> Any:
-        """Return the result of a callback as expressions; `v`: expressions that replace the inputs `self.v`.
+        """Return the result of a callback, such as "mass", as an array of expressions of t, q and v.
 
-        If there is no callback, the result is derived from other callbacks (C_q, gamma), or consists of zeros (others).
-        Raise Untraceable if a callback does not run on symbols; the message names the callback and the reason.
+        If the system has no such callback, C_q and gamma are derived from others; all other results are zeros. `v`:
+        expressions that replace the inputs `self.v`. Raise Untraceable if a callback does not run on symbols.
         """
         if v is not None and "v" in KINDS[kind].state:
             return self._derive_or_trace(kind, v)
@@ -319,7 +319,7 @@ class Equations:
         return self._expressions[kind].copy()
 
     def derivatives(self, kind: str, v: Sequence[Affine] | None = None) -> Any:
-        """Return C_q, C_t or gamma as derivatives of other callbacks, even if there is a callback for it."""
+        """Return C_q, C_t or gamma as derivatives of other callbacks, even if the system has a callback for it."""
         if kind == "jacobian":
             return self._jacobian()
         if kind == "constraint_rate":
@@ -328,7 +328,7 @@ class Equations:
         return self._gamma(*GAMMA_SOURCES[kind], self.v if v is None else v)
 
     def _derive_or_trace(self, kind: str, v: Sequence[Affine]) -> Any:
-        """Return derivatives for C_q or gamma if there is no callback for it; for other callbacks, the trace."""
+        """Compute the result of `expressions`, as derivatives, or as a trace (of a copied object, if it has one)."""
         if self._is_derived(kind):
             return self.derivatives(kind, v)
         if kind in self._results_before_copy and v is self.v:
@@ -373,7 +373,7 @@ class Equations:
         return jacobian
 
     def _gamma(self, rows: str, rates: str, v: Sequence[Affine]) -> Any:
-        """Return -d/dt(G v + r) at constant v; `rows`, `rates`: callbacks for G and r (C_q and C_t, or A and b)."""
+        """Return gamma = -d/dt(G v + r) at constant v; `rows`, `rates`: callbacks for G and r: C_q, C_t, or A, b."""
         direction = {only_quantity(coordinate): u for coordinate, u in zip(self.q, v, strict=True)}
         total_derivative = Derivative(self.graph, {only_quantity(self.t): Affine(self.graph, 1.0, {}), **direction})
         gamma = self.expressions(rates)
@@ -386,7 +386,7 @@ class Equations:
 
 
 def runs_on_symbols(system: ConstrainedSystem, kind: str, parameters: Any) -> bool:
-    """Return whether a compiled callback can be traced with these parameters, some of which may be Parameters."""
+    """Return whether a compiled callback can be traced with these parameters, if some of them are Parameters."""
     equations = Equations(system, parameters)
     state = {"q": equations.q, "v": equations.v, "lam": equations.graph.inputs(system.n_c, True)}
     arrays = [symbol_array(state[name]) for name in KINDS[kind].state]
@@ -408,14 +408,14 @@ def only_quantity(expr: Affine) -> int:
 
 
 Array = NDArray[np.float64]
-# array of expressions in the form (scales, indices, products): its entry i is scales[i] * products[indices[i]]
+# array of expressions in parameters, as (scales, indices, products): its entry i is scales[i] * products[indices[i]]
 ScaledProducts = tuple[Array, NDArray[np.int64], list[Powers]]
-Evaluator = Callable[[Any], Array]  # function that evaluates an array of expressions for the parameters of one system
+Evaluator = Callable[[Any], Array]  # function that evaluates arrays of expressions for the parameters of one system
 
-# range of the random values that replace parameters in traces; values of similar size, so that rounding hides no term
+# range of the random numbers that replace parameters in traces; all of similar size, so that rounding hides no term
 GENERIC_RANGE = 0.5, 1.5
-# a parameter whose magnitude is below this value, or above its inverse, is a constant in traces: its powers might
-# underflow or overflow
+# a parameter is a constant in traces if its magnitude is below this value, or above the inverse: powers of such
+# parameters might underflow or overflow
 MIN_MAGNITUDE = 1e-30
 
 _TRACE_CACHES = BoundedCache()
@@ -425,19 +425,19 @@ class TraceCache:
     """Cache of traces, and of results derived from traces, for all systems that share their callbacks.
 
     parameters : parameters of one of the systems.
-    classes : class of each parameter: 0 if the parameter is a constant in the traces. Otherwise a number 1, 2, ...,
-        which is the same for parameters of equal magnitude, with the sign of the parameter.
+    classes : class of each parameter. 0: the parameter is a constant in the traces. 1, 2, ...: number of a class, whose
+        parameters have equal magnitudes; with a minus sign if the parameter is negative.
     Fields:
     parameters : parameters with which callbacks are traced: Parameters with random values, and constants.
-    traced_kinds : kinds of callbacks that were traced. They do not branch, and so always write to the same entries.
-    within_bounds : kinds of traced callbacks whose indices were checked in one of the systems: all are within bounds.
+    traced_kinds : names of callbacks that were traced: they do not branch, and always write to the same entries.
+    within_bounds : names of traced callbacks that were found, for one of the systems, to use no index out of bounds.
     """
 
     def __init__(self, parameters: Array, classes: NDArray[np.int64]):
         self._classes = classes
         size = int(np.abs(self._classes).max(initial=0))
         _, first = np.unique(np.abs(self._classes), return_index=True)
-        self._first_of_class = first[self._classes[first] != 0]  # index of the first parameter of each class
+        self._first_of_class = first[self._classes[first] != 0]  # index of the first parameter in class 1, 2, ...
         self._tape = ParameterTape(np.random.default_rng(7).uniform(*GENERIC_RANGE, size).tolist(), range(size))
         self.parameters = parameters.astype(object) if self._classes.any() else parameters.copy()
         for i in np.flatnonzero(self._classes).tolist():
@@ -447,19 +447,19 @@ class TraceCache:
         self.traced_kinds: set[str] = set()
         self.within_bounds: set[str] = set()
         self._results: dict[Any, Any] = {}
-        # results of `_scaled_products`; keys: id(array); the arrays are stored, too, so that no other gets the same id
+        # results of `_scaled_products`; keys: id(array). The arrays are stored, so that no other array gets the same id
         self._arrays: dict[int, tuple[Any, ScaledProducts]] = {}
         self._tracing_lock = RLock()  # one lock for all traces, because they share one ParameterTape
 
     def equations(self, system: ConstrainedSystem) -> Equations:
         """Return the traced callbacks of a system, with their own copy of the graph, which the caller may extend."""
-        if system.called_in_python:  # trace each only when needed: Python functions may store the symbols
+        if system.called_in_python:  # trace a callback only when needed: Python functions may store the symbols
             return Equations(system, self.parameters)
         traced: Equations = self.remembered("equations", lambda: Equations(system, self.parameters).trace_all())
         return traced.copy()
 
     def magnitudes(self, parameters: Array) -> Array:
-        """Return the common magnitude of the parameters of each class, see TraceCache; class k has the index k - 1."""
+        """Return the magnitudes of the parameters in the classes 1, 2, ... (see TraceCache), one for each class."""
         return np.abs(parameters[self._first_of_class])
 
     def product_evaluator(self, parameters: Array) -> Callable[[Powers], Any]:
@@ -467,7 +467,7 @@ class TraceCache:
         return self._tape.product_evaluator(self.magnitudes(parameters))
 
     def evaluator(self, parameters: Array) -> Evaluator:
-        """Return a function that evaluates arrays of expressions for `parameters`; arrays must not change later."""
+        """Return a function that evaluates arrays of expressions for `parameters`; these arrays must not change."""
         product = self.product_evaluator(parameters)
 
         def evaluate(array: Any) -> Array:
@@ -476,14 +476,14 @@ class TraceCache:
             scales, indices, products = self._scaled_products(array)
             with np.errstate(all="ignore"):
                 values: Array = scales * np.array(list(map(product, products)))[indices]
-            if not np.isfinite(values).all():  # for example, an expression divides by a sum of parameters that is zero
+            if not np.isfinite(values).all():  # for example if a sum of parameters is zero, and a divisor
                 raise Untraceable("a number of them is not finite for these parameters")
             return values
 
         return evaluate
 
     def _scaled_products(self, array: Any) -> ScaledProducts:
-        """Return the ScaledProducts of an array of expressions, computed at the first call for this array object."""
+        """Return an array of expressions as ScaledProducts, from the cache if this array object was used before."""
         entry = self._arrays.get(id(array))
         if entry is None:
             powers = [x.powers if type(x) is Parameter else () for x in array.ravel()]
@@ -495,11 +495,11 @@ class TraceCache:
         return entry[1]
 
     def remembered(self, key: Any, make: Callable[[], Any]) -> Any:
-        """Return the cached result for `key`; `make` computes it at the first call."""
+        """Return the cached result for `key`; at the first call, `make` computes it."""
         if key not in self._results:
             with self._tracing_lock:
                 if key not in self._results:
-                    with garbage_collection_off():  # `make` leaves no garbage: all its objects stay in the cache
+                    with garbage_collection_off():  # a collection would free nothing: all new objects stay in the cache
                         self._results[key] = make()
         return self._results[key]
 
@@ -507,12 +507,13 @@ class TraceCache:
 def derive_cached(
     system: ConstrainedSystem, key: Any, make: Callable[[TraceCache], Any], check: Callable[[Any], None]
 ) -> Any:
-    """Return what `make` derives from traces (for example a series), with the parameters of one system inserted.
+    """Return what `make` derives from traces, for example a program, with the coefficients of one system.
 
-    `make` gets a TraceCache, and returns an object with a method `specialize`. Results are cached by `key`. First, the
-    TraceCache that is shared with other systems is used. If callbacks cannot be traced with variable parameters, or if
-    `check` raises Untraceable for the result (a callback may treat variable parameters differently from numbers), a
-    cache for this system alone is used. If this fails in the same way, Untraceable is raised.
+    `make` gets a TraceCache, and returns an object with a method `specialize`, which inserts the parameters of the
+    system. Results are cached by `key`. `check` raises Untraceable if a result does not agree with the callbacks.
+
+    First, the TraceCache that is shared with systems of other parameters is used. If callbacks branch on parameters, or
+    `check` fails, a TraceCache of this system alone is used. If this also fails, Untraceable is raised.
     """
     for find_cache in (_own_cache,) if system.called_in_python else (trace_cache_of, _own_cache):
         cache = system.remembered(("trace cache", find_cache), partial(find_cache, system))
@@ -529,7 +530,7 @@ def derive_cached(
 
 
 def _derive_shared(system: ConstrainedSystem, cache: TraceCache, key: Any, make: Callable[[TraceCache], Any]) -> Any:
-    """Return what `make` derives from `cache`, specialized for `system`; if this fails, return the exception."""
+    """Return the result of make(cache) with the coefficients of `system`; if this fails, return the Untraceable."""
     try:
         result = cache.remembered(key, partial(make, cache))
         return result.specialize(
@@ -542,28 +543,28 @@ def _derive_shared(system: ConstrainedSystem, cache: TraceCache, key: Any, make:
 
 
 def load_checked_bounds(system: ConstrainedSystem) -> None:
-    """Mark callbacks as checked for indices out of bounds if they were checked in another system with equal traces."""
+    """Mark callbacks as checked for indices out of bounds if another system with the same TraceCache checked them."""
     if not system.called_in_python:
         system.within_bounds |= shared_cache(system).within_bounds
 
 
 def share_checked_bounds(system: ConstrainedSystem) -> None:
-    """Note in the trace cache which traced callbacks were checked for indices out of bounds: others skip the check."""
+    """Tell systems with the same TraceCache which traced callbacks were checked for indices out of bounds."""
     if not system.called_in_python:
         cache = shared_cache(system)
         cache.within_bounds |= cache.traced_kinds & system.within_bounds
 
 
 def shared_cache(system: ConstrainedSystem) -> TraceCache:
-    """Return the trace cache that a system shares with others, see `trace_cache_of`; the system keeps it."""
+    """Return the TraceCache that a system shares with others (see `trace_cache_of`), and store it in the system."""
     return system.remembered(("trace cache", trace_cache_of), partial(trace_cache_of, system))  # type: ignore[no-any-return]
 
 
 def trace_cache_of(system: ConstrainedSystem) -> TraceCache:
-    """Return the trace cache that a system with compiled callbacks shares with others; create the cache if missing."""
+    """Return the TraceCache of all systems with the same compiled callbacks, sizes and classes of parameters."""
     parameters = system.parameters
     classes = _parameter_classes(parameters)
-    fixed_parameters = parameters[classes == 0] + 0.0  # -0.0 becomes 0.0, so that the bytes are equal
+    fixed_parameters = parameters[classes == 0] + 0.0  # -0.0 becomes 0.0, so that keys with zeros are equal
     key = (*system.given.items(), system.n_q, system.n_c, system.n_a, classes.tobytes(), fixed_parameters.tobytes())
     cache: TraceCache | None = _TRACE_CACHES.get(key)
     if cache is None:
@@ -572,12 +573,12 @@ def trace_cache_of(system: ConstrainedSystem) -> TraceCache:
 
 
 def _own_cache(system: ConstrainedSystem) -> TraceCache:
-    """Return a new trace cache for one system, all of whose parameters are constants in the traces."""
+    """Return a new TraceCache for one system alone: all parameters are constants in its traces."""
     return TraceCache(system.parameters, np.zeros(system.parameters.size, dtype=np.int64))
 
 
 def _parameter_classes(parameters: Array) -> NDArray[np.int64]:
-    """Return the class of each parameter, see `TraceCache`; classes are numbered in the order of the parameters."""
+    """Return the class of each parameter, see `TraceCache`; classes are numbered in the order of first use."""
     magnitudes = np.abs(parameters)
     varies = (magnitudes > MIN_MAGNITUDE) & (magnitudes < 1.0 / MIN_MAGNITUDE) & (magnitudes != np.floor(magnitudes))
     _, first, inverse = np.unique(magnitudes[varies], return_index=True, return_inverse=True)
@@ -589,12 +590,12 @@ def _parameter_classes(parameters: Array) -> NDArray[np.int64]:
 
 
 class ParameterArrays:
-    """Arrays of numbers that replace arrays of expressions in parameters; `write` updates them to new parameters."""
+    """Arrays of numbers that stand for arrays of expressions; `write` overwrites them by values for new parameters."""
 
     def __init__(self) -> None:
-        # keys: id(array of expressions); values: this array, which must exist as long as its id is used; its numbers
+        # keys: id(array of expressions); values: this array, stored so that no other gets its id; the array of numbers
         self._arrays: dict[int, tuple[Any, Array]] = {}
-        # tuples: flat array of numbers; indices of its entries that vary; range of these entries in `values` of `write`
+        # for each array: its numbers, flat; indices of the entries that vary; range of these in `values` of `write`
         self._number_arrays: list[tuple[Array, NDArray[np.int64], slice]] = []
         self._products: dict[Powers, int] = {}
         self._scales: list[float] = []
@@ -602,7 +603,7 @@ class ParameterArrays:
         self._gathered_products: tuple[list[Powers], Array, NDArray[np.int64]] | None = None
 
     def array(self, exprs: Any) -> Array:
-        """Return the array of numbers for `exprs`, the same in later calls; `exprs` itself if it has numbers only."""
+        """Return the array of numbers for `exprs`, the same in all calls; `exprs` itself if it has numbers only."""
         if exprs.dtype != object:
             return exprs  # type: ignore[no-any-return]
         if id(exprs) not in self._arrays:
@@ -610,7 +611,7 @@ class ParameterArrays:
         return self._arrays[id(exprs)][1]
 
     def _numbers_for(self, exprs: Any) -> Array:
-        """Return an array of numbers for `exprs`; it contains constants now, and values of Parameters after `write`."""
+        """Return a new array of numbers for `exprs`: constants now, and 0 for Parameters, whose values `write` sets."""
         entries, begin = exprs.ravel().tolist(), len(self._scales)
         varying = [k for k, entry in enumerate(entries) if type(entry) is Parameter]
         for k in varying:
@@ -627,7 +628,7 @@ class ParameterArrays:
         return numbers.reshape(exprs.shape)
 
     def write(self, product: Callable[[Powers], Any]) -> None:
-        """Evaluate all expressions and write their values to the arrays; `product`: see `product_evaluator`."""
+        """Write the values of all expressions to the arrays; `product`: function from `product_evaluator`."""
         if self._gathered_products is None:
             return
         products, scales, product_indices = self._gathered_products

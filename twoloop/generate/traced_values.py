@@ -24,34 +24,36 @@ from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
 
-# kinds of callbacks that are traced, in the order in which the kernel calls them
+# callbacks whose traces are compared with calls, in the order in which the kernel calls them
 KINDS = (
     *("mass", "force", "constraint", "jacobian", "constraint_rate", "gamma"),
     *("nonholonomic", "nonholonomic_rate", "nonholonomic_gamma"),
 )
-N_NEARBY = 8  # number of random states near the start at which calls and traces are compared, besides the start
+N_NEARBY = 8  # before a run, calls and traces are compared at the start and at this number of random states near it
 RELATIVE_TIMES = np.linspace(0.0, 1.0, N_NEARBY)  # times of the random states, from 0 (start of the run) to 1 (its end)
 NEARBY_DISTANCE = 0.3  # largest distance of a random position from the start, relative to the sizes of the coordinates
-# approximate largest number of compared states: in a chunk of steps that are stored together; in a run; in a run with
-# callbacks that are called in Python
+# largest numbers of states, about: that a `Sample` takes from one chunk of steps; that are compared after a run (also
+# largest number of chunks in a `Sample`); that are compared if callbacks are called in Python
 MAX_STATES_OF_CHUNK, MAX_STATES, MAX_STATES_IN_PYTHON = 32, 64, 9
-MAX_ENTRIES = 20_000  # approximate largest number of compared entries in a run: for large systems, fewer states suffice
-# limits of the difference between call and trace, as fractions of the largest term that the trace adds up in any entry
-# of the callback. Up to ROUNDING_DIFFERENCE, it counts as a rounding error. Above CLEAR_DIFFERENCE, the trace is wrong.
-# Between them, `_is_systematic` decides
+MAX_ENTRIES = 20_000  # about the largest number of entries that are compared: for large systems, fewer states suffice
+# limits of the difference between call and trace, relative to the largest term that the trace adds up in any entry of
+# the callback's result. Up to ROUNDING_DIFFERENCE, it is a rounding error; above CLEAR_DIFFERENCE, the trace is wrong;
+# in between, `_is_systematic` decides
 ROUNDING_DIFFERENCE = 16.0 * np.finfo(float).eps
 CLEAR_DIFFERENCE = 1e-6
-# `_is_systematic` compares call and trace at N_NEIGHBOURS states; PERTURBATION: their largest relative distance
+# `_is_systematic` compares call and trace at N_NEIGHBOURS states, whose relative distance is at most PERTURBATION
 PERTURBATION, N_NEIGHBOURS = 1e-7, 12
-MARGIN = 0.01  # a CheckedRegion exceeds the range of checked states by this fraction of it; most steps are longer
-MARGIN_AT_REST = 1e-9  # this fraction of the largest range is added, for coordinates at rest, whose own range is 0
+MARGIN = 0.01  # a CheckedRegion extends the range of checked states by this fraction; most steps move further
+MARGIN_AT_REST = 1e-9  # the region is also extended by this fraction of the largest range, for coordinates at rest
 
 
 class CallbackTraces:
     """Traces of callbacks as an operation table, to be compared with calls of the callbacks.
 
     graph : the graph of the trace, whose first inputs are t, q and v.
-    exprs : keys: kinds of callbacks; values: arrays of expressions. None: `graph.traced`, for callbacks of the system.
+    exprs : traced results to compare, as arrays of expressions; keys: names of callbacks, such as "mass". None: all
+        results in `graph.traced` for which the system has a callback.
+    is_trusted (field) : whether calls and traces agreed near a start; then later runs skip this comparison.
     """
 
     def __init__(self, system: ConstrainedSystem, graph: Graph, exprs: Mapping[str, Any] | None = None):
@@ -63,7 +65,7 @@ class CallbackTraces:
         self.is_compared = np.array([kind in kinds for kind in KINDS], dtype=np.int64)
         self.sizes = np.array([system.n_q, system.n_c, system.n_a], dtype=np.int64)
         self.name = system.name
-        self.kinds = frozenset(graph.traced)  # all kinds of callbacks that were traced, even if not compared
+        self.kinds = frozenset(graph.traced)  # names of all callbacks that were traced, even if not compared
         self.is_trusted = False
         entries = (exprs[kind][index] for kind, index in self.entry_indices)
         # entries that are always zero are left out of the table
@@ -72,13 +74,13 @@ class CallbackTraces:
         self.program = OperationTable.from_results(graph, 1 + 2 * system.n_q, results)
 
     def specialize(self, system: ConstrainedSystem, evaluate: Evaluator) -> "CallbackTraces":
-        """Return a copy for another system: coefficients of expressions are those that `evaluate` yields for it."""
+        """Return a copy for another system; `evaluate`: function that computes coefficients for its parameters."""
         traced = self.replace_coefficients(evaluate)
         traced.name = system.name
         return traced
 
     def replace_coefficients(self, convert: Callable[[Any], Array]) -> "CallbackTraces":
-        """Return a copy in which convert(array) replaces each array of coefficients; its `is_trusted` is False."""
+        """Return a copy, not trusted yet, in which convert(array) replaces each array of coefficients."""
         traced = copy.copy(self)
         traced.program = self.program.replace_coefficients(convert)
         traced.is_trusted = False
@@ -91,10 +93,10 @@ class CallbackTraces:
     def check_near_start(self, system: ConstrainedSystem, nearby: Array) -> None:
         """Compare calls and traces at the states `nearby`; raise Untraceable if they differ, else trust the traces."""
         difference = None
-        for states in (nearby, *nearby[:, None, :]):  # first all states at once; if a call raises, one after another
+        for states in (nearby, *nearby[:, None, :]):  # all states at once; then, only if a call raises, one by one
             try:
                 difference = difference or self.difference(system, states, everywhere=False)
-            except Exception:  # the callbacks are not defined at this state
+            except Exception:  # a callback is not defined at one of these states
                 continue
             if states is nearby:
                 break
@@ -105,8 +107,7 @@ class CallbackTraces:
     def difference(self, system: ConstrainedSystem, states: Array, everywhere: bool = True) -> str | None:
         """Return a message about the first difference of calls and traces at states [t, q, v], or None if they agree.
 
-        If a call returns a value that is not finite, the value of the trace must not be finite either. But if
-        `everywhere` is False, such values are not compared.
+        `everywhere`: whether calls that return NaN or inf are compared: then the trace must not be finite either.
         """
         from twoloop.kernels.evaluation import checks as kernels
 
@@ -125,7 +126,7 @@ class CallbackTraces:
         else:
             is_agreeing |= ~finite
         largest = np.where(np.isfinite(bounds), bounds, 0.0).max(axis=0)
-        # for each entry, the largest term in any entry of the same callback
+        # for each entry, the largest term in any entry of its callback: the scale of rounding errors
         max_term = np.repeat(np.maximum.reduceat(largest, np.cumsum(self.n_entries) - self.n_entries), self.n_entries)
         for k, entry in np.argwhere(~is_agreeing & ~(differences <= ROUNDING_DIFFERENCE * max_term)):
             if not differences[k, entry] <= CLEAR_DIFFERENCE * max_term[entry] or self._is_systematic(
@@ -152,7 +153,7 @@ class CallbackTraces:
         return n_different, called, traced, bounds
 
     def _is_systematic(self, system: ConstrainedSystem, state: Array, entry: int) -> bool:
-        """Return True if call and trace differ by similar amounts at states nearby; a rounding error would vary."""
+        """Return True if, at states nearby, call - trace has one sign and similar sizes; rounding errors vary."""
         directions = np.random.default_rng(5).uniform(-1.0, 1.0, (N_NEIGHBOURS, len(state)))
         _, called, traced, _ = self._evaluate(system.kit, state * (1.0 + PERTURBATION * directions))
         errors = (called - traced)[:, entry]
@@ -170,14 +171,14 @@ class CallbackTraces:
 
 
 class Sample:
-    """Sample of the states [t, q, v] of a run so far; in a long run, evenly spaced ones. `n`: length of [q, v]."""
+    """States [t, q, v] of a run for the comparison after it; of a long run, every k-th. `n`: length of [q, v]."""
 
     def __init__(self, t: float, state: Array, n: int) -> None:
         self._n, self._chunks = n, list[Array]()
         self.add(state[:0], state[None, :][:0], t, state)
 
     def add(self, t: Array, rows: Array, end: float, state: Array) -> None:
-        """Add states of successive steps: `rows` [q, v, ...] at the times `t`, and the last state, `state` at `end`."""
+        """Add states of successive steps: `rows` [q, v, ...] at times `t` (of many, every k-th); `state` at `end`."""
         stride = 1 + len(t) // MAX_STATES_OF_CHUNK
         times = t[::stride]
         states = np.empty((len(times) + 1, 1 + self._n))
@@ -201,10 +202,7 @@ class Sample:
 def refuse_wrong_traces(
     traced: Sequence[CallbackTraces], system: ConstrainedSystem, t0: float, t1: float, q: Array, v: Array
 ) -> None:
-    """Compare traces that are not trusted yet with calls, at states near the start with times spread over the run.
-
-    Raise Untraceable if a trace is wrong; the message names the callback and the entry.
-    """
+    """Compare traces that are not trusted yet with calls, near the start; raise Untraceable if a trace is wrong."""
     untrusted = [trace for trace in traced if not trace.is_trusted]
     if not untrusted:
         return
@@ -215,11 +213,11 @@ def refuse_wrong_traces(
             trace.check_near_start(system, nearby)
 
 
-Check = Callable[[CallbackTraces], None]  # function that raises Untraceable if traces are wrong
+Check = Callable[[CallbackTraces], None]  # function that compares traces with calls; raises Untraceable if they differ
 
 
 def accept_traces(traced: CallbackTraces) -> None:
-    """Accept any traces without a comparison; this `Check` is for results that no run uses."""
+    """Do not compare traces: this `Check` is for results from which no motion is computed, such as a cost."""
 
 
 def states_near_start(t0: float, t1: float, q: Array, v: Array) -> Array:
@@ -237,7 +235,7 @@ def states_near_start(t0: float, t1: float, q: Array, v: Array) -> Array:
 
 @cache
 def _random_directions(n_q: int) -> Array:
-    """Return an array (2, N_NEARBY, n_q) of random numbers between -1 and 1, the same in every call."""
+    """Return random numbers between -1 and 1, shape (2: for q and v, N_NEARBY, n_q), the same in every call."""
     return np.random.default_rng(6).uniform(-1.0, 1.0, (2, N_NEARBY, n_q))
 
 
@@ -248,7 +246,7 @@ def extreme_states(t: Array, rows: Array) -> Array:
 
 
 class CheckedRegion:
-    """Region in which callbacks agreed with their traces: ranges of the states [t, q, v], and of the parameters.
+    """Ranges of states [t, q, v] and of parameters in which callbacks agreed with their traces in earlier runs.
 
     bounds : smallest and largest t, q and v of checked states, with a margin; states in between need no comparison.
     """
@@ -260,7 +258,7 @@ class CheckedRegion:
         self.bounds = self._ranges
 
     def is_comparison_due(self) -> bool:
-        """Return whether the next run compares calls and traces at all sampled states: runs 1, 2, 4, 8, ... do."""
+        """Return whether the next run compares calls and traces at all sampled states: runs 1, 2, 4, 8, ... do so."""
         return (self._runs + 1) & self._runs == 0
 
     def count_run(self) -> None:
