@@ -1,9 +1,8 @@
 """Attempt steps by backward differentiation formulas of orders 1 to 5, with a fixed-point outer loop.
 
-The formulas apply to the independent positions and velocities (q_i, v_i). The history consists of modified divided
-differences (Krogh), scaled to the step size as in DASSL and IDA (fixed leading coefficient), so that the step size can
-change in every step. With equal steps, they are backward differences. Differences of all coordinates and velocities are
-stored, so that a new partition needs no conversion. `f` is the kit, `w` the workspace.
+The formulas apply to the independent positions and velocities (q_i, v_i). The history is a table of modified divided
+differences (Krogh) of all coordinates and velocities, so that a new partition needs no conversion. They are scaled to
+the size of each step, as in DASSL and IDA (fixed leading coefficient). `f` is the kit, `w` the workspace.
 """
 
 from typing import Any
@@ -24,18 +23,18 @@ N_DIFFERENCES = MAX_ORDER + 2  # differences of orders 0 to MAX_ORDER + 1
 STARTER_STAGES = 3  # number of stages of the Gauss steps at the beginning of a run with fixed step size
 MAX_ITERATIONS = 60  # number of fixed-point iterations after which a step has failed
 SAFETY = 0.9  # safety factor on the size of a repeated step; also smallest ratio of step sizes after an accepted step
-MIN_STEP_FACTOR = 0.2  # smallest ratio of step sizes after a rejection, or if predictions are far from the constraints
+MIN_STEP_FACTOR = 0.2  # smallest ratio of step sizes after a rejected step, or if `prediction_error` is large
 ERROR_FACTOR = 10.0  # factor on the error estimate, because the errors of many short steps add up
 STEP_SIZE_FACTOR = 6.0  # further factor on the estimate in the choice of the next step size, to avoid rejections (VODE)
 ORDER_FACTOR = 1.4  # factor on the error estimates of the next lower and higher order, so that the order changes rarely
 MIN_INCREASE = 1.2  # the step size is kept if it could grow by less than this factor
 MAX_INCREASE = 2.0  # largest ratio of successive step sizes
 
-# indices in `options`: largest order, tolerances of the inner and of the outer loop. The options of Gauss steps follow
+# indices in `options`: largest order, tolerances of inner and outer loop. Numbers for `_gauss_step` follow
 HIGHEST, INNER_TOL, OUTER_TOL, N_OPTION_SCALARS = range(4)
 # indices of the scalars in `memory`; the arrays of _coefficient_row and _history_views follow
 (
-    HAS_TRIAL,  # 1: the last attempt has stored the differences at the end of its step
+    HAS_TRIAL,  # 1: the last attempt has computed a step, with its differences; 0: it has failed
     ORDER,  # order of the next attempt
     DEPTH,  # order of the highest difference in the history
     AGE,  # number of accepted steps since the last change of order or the last rejected step
@@ -43,8 +42,8 @@ HIGHEST, INNER_TOL, OUTER_TOL, N_OPTION_SCALARS = range(4)
     NEXT_DEPTH,  # value of DEPTH after the attempted step, if it is accepted
     N_MEMORY_SCALARS,
 ) = range(7)
-# indices of the rows of coefficients in `memory`. SPANS: times (s) from earlier states of the history to the last one.
-# NEW_SPANS: times (s) from all states of the history to the end of the step. ERROR_CONSTANTS: by order, from 0
+# indices of rows in `memory`. SPANS: times (s) from earlier states of the history to the last one. NEW_SPANS: times (s)
+# from states of the history to the end of the step. ERROR_CONSTANTS[k]: ratio of error to difference k + 1 at order k
 SPANS, NEW_SPANS, ERROR_CONSTANTS, N_ROWS = range(4)
 
 
@@ -68,10 +67,10 @@ def _coefficient_row(memory, row):
 
 @inlined
 def _history_views(memory, n):
-    """Return views of `memory`: history, trial differences (of the attempted step), prediction, rate, and scratch.
+    """Return views of `memory`: differences of the history, and of the attempted step; prediction; rate; scratch.
 
-    The first two are tables of differences (N_DIFFERENCES, 2 n). `prediction` is the predicted (q, v) at the end of the
-    step, and `rate` its time derivative (2 n each).
+    The first two are tables (N_DIFFERENCES, 2 n): row k contains the differences of order k of (q, v). `prediction` is
+    the predicted (q, v) at the end of the step, and `rate` its time derivative (2 n each).
     """
     begin = N_MEMORY_SCALARS + N_ROWS * N_DIFFERENCES
     size = N_DIFFERENCES * 2 * n
@@ -84,7 +83,7 @@ def _history_views(memory, n):
 
 @kernel(COMMIT)
 def commit_bdf(f, w, options, memory, tolerances, accepted):
-    """Set the order of the next step; if the last step was accepted, its trial differences become the history."""
+    """Set the order of the next step; if the last step was accepted, its differences replace the history."""
     differences, trial, _, _, _ = _history_views(memory, w.Q.size)
     has_trial = memory[HAS_TRIAL]
     memory[HAS_TRIAL] = 0.0
@@ -104,7 +103,7 @@ def commit_bdf(f, w, options, memory, tolerances, accepted):
 
 @compiled
 def _begin_history(memory, differences, state, h, order):
-    """Start a history of order `order`, 0 or 1, from `state` and its derivative, for steps of size h (s)."""
+    """Start a history from `state` = [q, v, a, ...] for steps of size h (s); `order` (0 or 1): of the first step."""
     size = differences.shape[1]
     for m in range(size):
         differences[0, m] = state[m]
@@ -116,10 +115,10 @@ def _begin_history(memory, differences, state, h, order):
 
 @compiled
 def _predict_state(memory, differences, trial, h, prediction, rate):
-    """Scale the differences to a step of size h (s), and store them in `trial`; predict the end of the step.
+    """Extrapolate the history to the end of a step of size h (s): store the `prediction` of (q, v), and its `rate`.
 
-    `prediction` becomes the value at the end of the step, and `rate` the time derivative there, of the polynomial of
-    degree ORDER through the history. Also store NEW_SPANS and ERROR_CONSTANTS in `memory`.
+    These are the value and the time derivative of the polynomial of degree ORDER through the history. Also store the
+    differences, scaled to the step size, in `trial`, and NEW_SPANS and ERROR_CONSTANTS in `memory`.
     """
     k, depth = int(memory[ORDER]), int(memory[DEPTH])
     spans, new_spans = _coefficient_row(memory, SPANS), _coefficient_row(memory, NEW_SPANS)
@@ -157,7 +156,7 @@ def _corrector_coefficient(h, k):
 
 @compiled
 def _correct_state(f, w, options, t, c, prediction, rate, new_state, a_new):
-    """Solve y = prediction + c (y' - rate) at time t, where y = (q_i, v_i) are independent entries; return a code.
+    """Solve y = prediction + c (y' - rate) at time t, for the independent entries y = (q_i, v_i); return a code.
 
     The outer loop iterates on the independent accelerations. On return, `new_state` is [q, v, a, lam], and satisfies
     the equations of motion and the constraints. `c`: see `_corrector_coefficient`; a_new: scratch.
@@ -195,7 +194,7 @@ def _correct_state(f, w, options, t, c, prediction, rate, new_state, a_new):
 
 @compiled
 def _difference_norm(tolerances, y, y1, d, sign, difference):
-    """Return the largest |d + sign * difference| / (atol + rtol max(|y|, |y1|)); y, y1, d: see `_choose_order`."""
+    """Return the largest |entry| of d + sign * difference in units of the tolerances; y, y1, d: see `_choose_order`."""
     n_q = d.size // 2
     largest = 0.0
     for m in range(d.size):
@@ -206,14 +205,14 @@ def _difference_norm(tolerances, y, y1, d, sign, difference):
 
 @compiled
 def _choose_order(options, memory, tolerances, trial, y, y1, d):
-    """Store NEXT_ORDER; return the error estimate, in tolerances, and the ratio of the next step size to this one.
+    """Choose the next order (NEXT_ORDER); return the error estimate, in tolerances, and (next step size) / (this one).
 
-    y, y1: (q, v) at the beginning and at the end of the step. d: y1 minus its prediction. `trial`: scaled differences.
+    y, y1: (q, v) at both ends of the step. d: y1 minus its prediction. `trial`: differences from `_predict_state`.
     """
     k, depth = int(memory[ORDER]), int(memory[DEPTH])
     spans, constants = _coefficient_row(memory, NEW_SPANS), _coefficient_row(memory, ERROR_CONSTANTS)
     norm = ERROR_FACTOR * _difference_norm(tolerances, y, y1, d, 0.0, d)
-    # if steps are unequal, interpolation of the history causes a second error; as in DASSL, the larger of both counts
+    # if steps are unequal, interpolation of the history causes a second error; as in DASSL, the larger error counts
     interpolation_error = spans[0] / spans[k]
     for j in range(k):
         interpolation_error += spans[0] / spans[j] - 1.0 / (j + 1.0)
@@ -248,7 +247,7 @@ def _choose_order(options, memory, tolerances, trial, y, y1, d):
 
 @compiled
 def _update_differences(memory, trial, y1, d):
-    """Replace scaled differences in `trial` by those at the end of the step, where (q, v) is y1 = prediction + d."""
+    """Replace the differences in `trial`, at the beginning of the step, by those at its end y1 = prediction + d."""
     k = int(memory[ORDER])
     memory[NEXT_DEPTH] = k + 1
     if memory[DEPTH] > k and k < MAX_ORDER:
@@ -264,7 +263,7 @@ def _update_differences(memory, trial, y1, d):
 
 @compiled
 def _gauss_step(f, w, options, tolerances, t, h, state, new_state, scratch):
-    """Compute a step of the Gauss method of order 6, to fill the history if the step size is fixed; return a code."""
+    """Compute one of the first steps, if the step size is fixed, by the Gauss method of order 6; return a code."""
     s, n = STARTER_STAGES, w.Q.size
     q, v, q1, v1 = state[:n], state[n : 2 * n], new_state[:n], new_state[n : 2 * n]
     own_options, no_rounding = options[N_OPTION_SCALARS:], scratch[:0].reshape((0, n))
@@ -285,7 +284,7 @@ def _gauss_step(f, w, options, tolerances, t, h, state, new_state, scratch):
 def bdf_step(f, w, options, memory, t, h, tolerances, state, new_state):
     """Attempt a step: predict from the history, correct, and choose the order and the size of the next step.
 
-    If the step size is fixed, the order is options[HIGHEST]; the same number of Gauss steps fills the history before.
+    If the step size is fixed, the order is options[HIGHEST]; as many Gauss steps, at the start, fill the history.
     """
     n = w.Q.size
     differences, trial, prediction, rate, scratch = _history_views(memory, n)

@@ -31,7 +31,7 @@ from twoloop.kernels.steps.stages import (
 
 @kernel(COMMIT)
 def commit_runge_kutta(f, w, options, memory, tolerances, accepted):
-    """If `accepted`, store the stage accelerations and the rounding errors of the attempted step."""
+    """If the attempted step was accepted, keep its stage accelerations and rounding errors for the next step."""
     s, n = int(options[STAGES]), w.Q.size
     if accepted and memory[at.HAS_TRIAL] == 1.0:
         previous, trial = memory_block(memory, s, n, at.A_PREVIOUS), memory_block(memory, s, n, at.A_TRIAL)
@@ -50,9 +50,9 @@ def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
     """Attempt a step by fixed-point iteration; estimate its error from a step of size h and two steps of size h/2.
 
     The new state is the end of the second half step. If options[EXTRAPOLATION] is not 0, it is extrapolated from the
-    ends of the whole step and of the half steps, and projected onto the constraints. The polynomial through
-    the stage accelerations of the last accepted step predicts the stages of the whole step; the polynomial of the whole
-    step predicts the stages of the half steps. If the step size is fixed, only the whole step is computed.
+    ends of the whole step and of the half steps, and projected onto the constraints. The first guess of stages is the
+    polynomial through the stage accelerations: of the last accepted step for the whole step, of the whole step for half
+    steps. If the step size is fixed, only the whole step is computed.
     """
     s, _, _, _, _, c = tableau_of(options)
     n = w.Q.size
@@ -92,7 +92,7 @@ def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
         )
         if code != DONE:
             return Attempt(code, np.inf, 0.0)
-        # take the larger value of the half steps; that of the whole step does not count, because its end is discarded
+        # the prediction error of the whole step does not count, because its end is discarded
         prediction_error = max(prediction_error, prediction_error_mid)
         code, error = estimate_and_extrapolate(
             f, w, options[EXTRAPOLATION], options[INNER_TOL], t + h, tolerances, q, v, q_full, v_full, q1, v1
@@ -110,12 +110,12 @@ def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
 RUNGE_KUTTA = Step(runge_kutta_step, commit_runge_kutta)
 
 
-SUDDEN_ERROR = 10.0  # a step is rejected if `jump_error` (in tolerances) is larger; not in the paper
+SUDDEN_ERROR = 10.0  # steps with a larger `estimate_end_error` * END_ERROR_WEIGHT are rejected: not in the paper
 
 
 @kernel(ATTEMPT)
 def paper_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """Attempt a step as in Sects. 3.1-3.3 of the paper; estimate its error by comparison with two steps of h/2."""
+    """Attempt a step of size h as in Sects. 3.1-3.3 of the paper; estimate its error by comparison with two of h/2."""
     s, _, _, _, _, _ = tableau_of(options)
     n = w.Q.size
     q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]

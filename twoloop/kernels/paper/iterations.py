@@ -1,10 +1,9 @@
 """Solve for the stages of implicit Runge-Kutta steps by one of two fixed-point iterations, the outer loops.
 
-`iterate_accelerations` iterates on the stage accelerations, from which the tableau, applied once and twice, yields
-velocities and positions. `iterate_first_order` is the loop of the paper on y_i = [v_i, q_i], the independent velocities
-and positions. Equation numbers refer to the paper; `f` is the kit, `w` the workspace.
-
-Richardson's error estimate is the difference between a step and two half steps; it also allows extrapolation.
+`iterate_accelerations` iterates on the stage accelerations: from these, the tableau yields velocities and, applied
+twice, positions. `iterate_first_order` is the loop of the paper on y_i = [v_i, q_i], the independent velocities and
+positions. Richardson's error estimate is the difference between a step and two half steps. Equation numbers refer to
+the paper; `f` is the kit, `w` the workspace.
 """
 
 import numpy as np
@@ -20,10 +19,11 @@ from twoloop.kernels.steps.stages import INNER_TOL, OUTER_TEST, OUTER_TOL, table
 # in steps of fixed size are compensated for these errors, because otherwise the energy of symmetric methods drifts
 N_ROUNDING = 4
 
-# indices of scalars in `memory`: 1 if a step was attempted, and the step's size (s); the same of the last accepted step
+# indices of scalars in `memory`. HAS_TRIAL: 1 if a step was attempted, else 0. H_TRIAL: the size of this step (s).
+# HAS_PREVIOUS, H_PREVIOUS: the same of the last accepted step
 HAS_TRIAL, H_TRIAL, HAS_PREVIOUS, H_PREVIOUS, N_MEMORY_SCALARS = range(5)
-# indices of the blocks (s, n_q) in `memory`, with a row for each stage: accelerations in the last accepted step, in the
-# attempted step, and in a half step; positions and velocities
+# indices of blocks (s, n_q) in `memory`, a row for each stage. A_PREVIOUS: accelerations of the last accepted step.
+# A_TRIAL: of the attempted step. A_HALF: of a half step. Q_STAGE, V_STAGE: positions and velocities
 A_PREVIOUS, A_TRIAL, A_HALF, Q_STAGE, V_STAGE, N_BLOCKS = range(6)
 # indices of vectors (n_q) in `memory`: positions Q, velocities V, accelerations A. _FULL: at the end of the whole step.
 # _MID: after the first half step. _OLD: before an iteration. ROUNDING: first of N_ROUNDING vectors of rounding errors
@@ -66,7 +66,7 @@ def step_views(memory, s, n):
 
 @inlined
 def rounding_errors_of(memory, s, n, tolerances):
-    """Return a view (N_ROUNDING, n) of the rounding errors in `memory`; with step-size control, it is empty (0, n)."""
+    """Return a view (N_ROUNDING, n) of the rounding errors in `memory`; unless the step size is fixed, it is empty."""
     start, count = N_MEMORY_SCALARS + (N_BLOCKS * s + ROUNDING) * n, N_ROUNDING if tolerances[ESTIMATE] == 0.0 else 0
     return memory[start : start + count * n].reshape((count, n))
 
@@ -77,14 +77,14 @@ MAX_ITERATIONS_PAPER = 200  # number of iterations after which `iterate_first_or
 # first, because the iteration matrix is not normal
 MAX_GROWTH = 1e3
 MIN_ITERATIONS = 8  # after this number of iterations, a change that is not below the previous one means divergence
-UNDECIDED, CONVERGED, DIVERGED = range(3)
+UNDECIDED, CONVERGED, DIVERGED = range(3)  # codes of `_test_convergence`
 
 
 @merged
 def _test_convergence(change, last_change, first_change, iteration, tolerance, q):
-    """Return UNDECIDED, CONVERGED or DIVERGED, from the current, the previous and the first change of the stages.
+    """Decide whether an iteration has converged: return UNDECIDED, CONVERGED or DIVERGED.
 
-    An iteration has converged if the change is at most `tolerance`, or if rounding errors of q keep it from decreasing.
+    It has if the change of the stages is at most `tolerance`, or if rounding errors of q keep it from decreasing.
     """
     if change <= tolerance:
         return CONVERGED
@@ -108,7 +108,7 @@ def _compensated_sum(x, rounding, increment):
 
 @merged
 def _clear_rounding_errors(coordinates, rounding):
-    """Set the rounding errors of this attempt to zero for dependent `coordinates`, which the inner loop computes."""
+    """Set this attempt's rounding errors of dependent `coordinates` to zero, as these are no sums over the steps."""
     for i in range(N_ROUNDING // 2, rounding.shape[0]):
         for m in coordinates:
             rounding[i, m] = 0.0
@@ -116,12 +116,12 @@ def _clear_rounding_errors(coordinates, rounding):
 
 @compiled
 def iterate_accelerations(f, w, options, tolerances, t, h, q, v, A_stage, Q_stage, V_stage, q1, v1, rounding):
-    """Compute a step of size h from (q, v) by iterating on stage accelerations; return a code and `prediction_error()`.
+    """Compute a step of size h from (q, v) by iterating on stage accelerations; return a code and `prediction_error`.
 
     A_stage (s, n) contains predicted accelerations on entry, and the solution on return; (q1, v1) becomes the end of
     the step, on the constraints. The stages Q_j = q + c_j h v + h^2 sum_k (A A)_jk a_k and V_j = v + h sum_k A_jk a_k,
     with the tableau A, c, then satisfy eq. (17) of the paper. For undamped systems, an iteration gains as much accuracy
-    as two iterations by `iterate_first_order`. Sums are compensated if `rounding` has rows.
+    as two by `iterate_first_order`. If `rounding` has rows, sums are compensated for rounding errors.
     """
     s, A, A2, b, bA, c = tableau_of(options)
     n = q.size
@@ -183,7 +183,7 @@ def iterate_accelerations(f, w, options, tolerances, t, h, q, v, A_stage, Q_stag
 
 @merged
 def _largest_change(coordinates, q, v, q_old, v_old):
-    """Return the largest change, relative to max(1, |value|), of `coordinates` and their velocities in an iteration."""
+    """Return how much an iteration changes `coordinates` and velocities: max |change| / max(1, |value|)."""
     change = 0.0
     for m in coordinates:
         change = max(change, abs(q[m] - q_old[m]) / max(abs(q[m]), 1.0))
@@ -259,8 +259,8 @@ def iterate_first_order(f, w, options, t, h, q, v, a, A_stage, Q_stage, V_stage,
 def _richardson_error(tolerances, largest, q, v, q_full, v_full, q1, v1):
     """Return the norm of the difference between a step and two half steps, in units of the tolerances (eq. 26).
 
-    (q, v) is the beginning, (q_full, v_full) the end of the step, and (q1, v1) the end of the half steps. If `largest`,
-    the norm is the largest |component| of positions and velocities, else the root mean square (eq. 27).
+    (q, v) is the beginning, (q_full, v_full) the end of the step, and (q1, v1) the end of the half steps. The norm is
+    the largest |component| of positions and velocities if `largest` is True, else their root mean square (eq. 27).
     """
     rtol = tolerances[RTOL]
     total = 0.0
@@ -276,9 +276,10 @@ def _richardson_error(tolerances, largest, q, v, q_full, v_full, q1, v1):
 
 @compiled
 def estimate_and_extrapolate(f, w, factor, inner_tol, t, tolerances, q, v, q_full, v_full, q1, v1):
-    """Return a code and Richardson's error estimate, in units of the tolerances; if `factor` > 0, extrapolate (q1, v1).
+    """Return a code and Richardson's error estimate, in units of the tolerances; if it is at most 1, extrapolate.
 
-    (q1, v1) is the end of two half steps, (q_full, v_full) the end of a whole step. `factor`: 0 or 1 / (2^order - 1).
+    (q1, v1) is the end of two half steps, (q_full, v_full) the end of a whole step. Extrapolation adds to (q1, v1) the
+    `factor` 1 / (2^order - 1) times their difference, then projects; a factor of 0 means: no extrapolation.
     """
     error = _richardson_error(tolerances, factor > 0.0, q, v, q_full, v_full, q1, v1)
     if not (factor > 0.0 and error <= 1.0):

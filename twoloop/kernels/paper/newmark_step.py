@@ -9,15 +9,15 @@ from twoloop.kernels.evaluation.inner_loop import evaluate_state, rounding_floor
 from twoloop.kernels.linalg.dense import copy
 
 MAX_ITERATIONS = 60  # number of fixed-point iterations after which a step has failed
-# if a step increases the largest |coordinate| by more than this factor, `_motion_rate` returns at most 1 / `gap`
+# if a step increases the largest |coordinate| by more than this factor, motion begins: see `_motion_rate`
 GROWTH_AFTER_REST = 2.0
 TINY = 1e-300  # added to the allowed error of a step, which may be 0 for a mechanism at rest at the origin
 
-# indices in `memory`: largest |coordinate|, |velocity| and |acceleration| so far. The new accelerations (n_q) follow
+# indices in `memory`: largest |coordinate|, |velocity| and |acceleration| so far. Scratch (n_q) follows
 SIZE, SPEED, ACCELERATION, N_MEMORY_SCALARS = range(4)
 
-# indices in `options`: parameters of Newmark's method, tolerances of inner and outer loop. ERROR_TOL: tolerance
-# for the norm by which the paper measures the error estimate; 0: `_estimated_error` uses atol and rtol instead
+# indices in `options`. BETA, GAMMA: parameters of Newmark's method. INNER_TOL, OUTER_TOL: tolerances of the loops.
+# ERROR_TOL: tolerance for the norm by which the paper measures the error estimate; 0: atol and rtol apply instead
 BETA, GAMMA, INNER_TOL, OUTER_TOL, ERROR_TOL, N_OPTIONS = range(6)
 
 
@@ -66,7 +66,7 @@ def _estimated_error(options, tolerances, rate, h, q, v, a, a1):
 
 @kernel(ATTEMPT)
 def newmark_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """Attempt a step of size h: iterate eq. (12) of the paper, and the inner loop, until accelerations converge."""
+    """Attempt a step of size h: iterate Newmark's formulas, eq. (12) of the paper, until the accelerations converge."""
     n = w.Q.size
     q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]
     q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
