@@ -12,8 +12,8 @@ matrices M and -G M^-1 G^T: none is zero.
 - If a row of G has a much smaller pivot than it would have without the other rows, it nearly depends on these rows, and
   the generated code reports that its results are invalid.
 - The same factors are used to compute the nearest position and velocity on the constraints, in the metric of M.
-- If M is singular, the sum M + s g^T g over some rows g of G replaces it ("rows are added to M"; s: scale of a row).
-  This changes neither accelerations nor projections.
+- If M is singular, terms s g^T g are added to it: g are rows of G, and s is the scale of a row. In short, "rows are
+  added to M". This changes neither accelerations nor projections.
 - If rows of G are redundant, the equations contain independent rows only.
 """
 
@@ -46,27 +46,26 @@ from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
 
-SINGULAR_MASS = 1e-10  # rows of G are added to M if the smallest eigenvalue of M is below this fraction of the largest
-RANK_TOL = 1e-9  # a row of G is dependent if the norm of its part orthogonal to others is below this fraction
-# a pivot of a row of G is measured relative to the pivot that the row has without the other rows. During a run, the
-# generated code accepts pivots down to about this fraction of the smallest pivot at the start
+SINGULAR_MASS = 1e-10  # M is singular if its smallest eigenvalue is below this fraction of its largest eigenvalue
+RANK_TOL = 1e-9  # a row of G depends on others if its part orthogonal to them is below this fraction of it
+# relative pivot of a row of G: its pivot / the pivot that it would have if G had no other rows. Generated code accepts
+# relative pivots down to `min_pivot`, which is about this fraction of the smallest one at the start
 PIVOT_FRACTION = 0.01
-# possible values of `PivotChoice.min_pivot`, the smallest accepted pivot; below the last, rounding errors dominate
-MIN_PIVOTS = 10.0 ** np.arange(-2, -9, -1)
-# the smallest accepted pivot is MIN_PIVOTS[i] for the first i with START_LIMITS[i] <= smallest pivot at the start; if
-# there is no such i, it is MIN_PIVOTS[-1]
+MIN_PIVOTS = 10.0 ** np.arange(-2, -9, -1)  # values of `min_pivot`; at smaller pivots, rounding errors would dominate
+# `min_pivot` is MIN_PIVOTS[i] for the first i with START_LIMITS[i] <= smallest relative pivot at the start; if there is
+# no such i, it is MIN_PIVOTS[-1]
 START_LIMITS = MIN_PIVOTS[:-1] / PIVOT_FRACTION
-# all rows of G are added to M on trial if the index of the smallest accepted pivot in MIN_PIVOTS is at least
+# if `min_pivot` is 10^-(k + 2), and k is at least the following limit, M + s G^T G replaces M on trial:
 # - MIN_INDEX_FEW, for at most N_FEW_COORDINATES coordinates
 # - MIN_INDEX_FEW_SINGULAR, if M is also singular: Euler parameters lose two digits even in sound models
 # - MIN_INDEX_MANY (plus one if M is singular), for more coordinates, because the code gets longer
 N_FEW_COORDINATES = 24
 MIN_INDEX_FEW, MIN_INDEX_FEW_SINGULAR, MIN_INDEX_MANY = 4, 5, 6
 ADDED_SIZE = 16.0  # if s G^T G is added to M, its largest entry is about this many times the largest entry of M
-MAX_PIVOT_RATIO = 1e5  # solutions are refined if a diagonal entry of M with added rows exceeds its pivot by this factor
-SCALE_STEP = 1024.0  # scales of added rows differ by powers of this large number, so that most starts share their code
+MAX_PIVOT_RATIO = 1e5  # solutions are refined if a diagonal entry of M with added rows is larger than this * its pivot
+SCALE_STEP = 1024.0  # ratios of scales s are powers of this number; as it is large, most starts have the same code
 DISPLACEMENT = 0.2  # displacement of coordinates (m or rad) to a position where no entry of M and G is zero by chance
-MIN_GAIN = 2  # rows added to M on trial are kept if they lower the index of min_pivot in MIN_PIVOTS by this or more
+MIN_GAIN = 2  # M + s G^T G replaces M if this raises `min_pivot` by at least this number of powers of ten
 # dependent coordinates are eliminated (null_space.py) only if there are at least this many constraints per coordinate:
 # otherwise the linear system for the multipliers is smaller
 MIN_ROW_RATIO = 2.0 / 3.0
@@ -81,8 +80,8 @@ class PivotChoice:
     rows : indices of the independent rows of G; the other rows are redundant.
     added_rows, scales : if M is singular or has little inertia about joints, M + sum_k scales[k] g^T g replaces M; g is
         row added_rows[k] of G. The sum is definite. Scales are powers of two; added terms are about as large as M.
-    min_pivot : results are valid if the pivot of each row of G, divided by the pivot that it would have without the
-        other rows, is at least min_pivot, a power of ten.
+    min_pivot : a power of ten. Results are valid if the pivot of each row of G, divided by the pivot that it would have
+        without the other rows, is at least min_pivot.
     blocks : pivot blocks in the order of elimination. A block consists of one or two rows (indices in `rows`), and as
         many dependent coordinates, for which these rows are solved. Empty: no dependent coordinates are eliminated.
     is_refined : whether solutions are improved by one step of refinement, because small pivots may cost digits.
@@ -103,19 +102,19 @@ class PivotChoice:
         """
         mass, G = mass_and_rows(system, t, q)
         choice = PivotChooser(system).choose(mass, G, partial(_nearby, system, t, q))
-        # refine solutions only if min_pivot has its smallest value, or little inertia may lose digits: in all other
-        # cases, random models had 8 correct digits without refinement
+        # refine solutions only if min_pivot is the smallest possible one, or if light bodies may lose digits: in all
+        # other cases, random models had 8 correct digits without refinement
         is_uncertain = choice.min_pivot <= MIN_PIVOTS[-1] or _hides_little_inertia(choice, mass, G)
         choice = replace(choice, is_refined=choice.is_refined or (bool(choice.rows) and is_uncertain))
         return replace(choice, blocks=DependentColumns(system, choice.rows).blocks(G))
 
 
 class DependentColumns:
-    """Choice of dependent coordinates at a position by a kernel, with the pivot blocks that solve rows of G for them.
+    """Chooser of the dependent coordinates, which the independent rows of G determine from the other coordinates.
 
     rows : indices of the independent rows of G.
-    choose (field) : compiled function of G and `arguments` that returns the number of blocks, see
-        linalg/dependent_columns.py. None: G has too few rows, or the kinds of its entries are unknown.
+    choose (field) : compiled function choose(G, *arguments), which stores pivot blocks and returns their number. None:
+        no coordinates are eliminated, as G has too few rows, or it is unknown which entries are constant.
     """
 
     choose: Any = None
@@ -159,7 +158,7 @@ def _entry_kinds(system: ConstrainedSystem) -> Any:
 
 
 class PivotChooser:
-    """Compiled search, with its scratch arrays, for the PivotChoice at any position of a system, given M and G."""
+    """Compiled search for the rows and pivots of the elimination at any position of a system; it keeps its arrays."""
 
     def __init__(self, system: ConstrainedSystem):
         from twoloop.kernels.linalg.rank import choose_rows, workspace_size
@@ -175,7 +174,8 @@ class PivotChooser:
     def choose(self, mass: Array, G: Array, nearby: Callable[[], tuple[Array, Array]]) -> PivotChoice:
         """Return the PivotChoice, without blocks, for M (n_q, n_q) and G (n_c + n_a, n_q).
 
-        `nearby` returns M and G at another position, where no entry is zero by chance. Raise like `PivotChoice.choose`.
+        `nearby` returns M and G at another position, where no entry is zero by chance. Raise Untraceable if M is
+        singular on velocities that the constraints allow.
         """
         system, scratch, chosen = self.system, self._scratch, self._row_indices
         is_definite = system.constant_mass and system.derived.get("no weak mass", False)
@@ -199,7 +199,7 @@ class PivotChooser:
         return choice
 
     def _index_with(self, choice: PivotChoice, scales: Sequence[float], mass: Array, G: Array) -> int:
-        """Return the index in MIN_PIVOTS that results if the rows `choice.added_rows` are added to M with `scales`.
+        """Return the index of `min_pivot` in MIN_PIVOTS if the rows `choice.added_rows` are added to M with `scales`.
 
         Return -1 if M with added rows is not positive definite, or if the independent rows differ from `choice.rows`.
         """
@@ -210,13 +210,12 @@ class PivotChooser:
         return index if index >= 0 and chosen[2 : 2 + chosen[0]].tolist() == list(choice.rows) else -1
 
     def _try_added_rows(self, choice: PivotChoice, factors: Array, mass: Array, G: Array, index: int) -> PivotChoice:
-        """Return `choice` with all independent rows added to M if this makes pivots much larger, else `choice` itself.
+        """Return a choice with M + s G^T G instead of M, if this makes pivots much larger; else return `choice`.
 
-        `factors`: factor on the scale s of each row. `index`: index of `choice.min_pivot` in MIN_PIVOTS. A body may
-        have little inertia about its joints, such as a rod with a mass in its middle. Then rows are nearly dependent in
-        the metric of M, and a smallest pivot of 10^-k costs up to 2 k digits of accelerations. In the metric of
-        M + s G^T G, rows are not nearly dependent. If s G^T G is 10^k times as large as M, k digits are lost, and
-        refinement restores them.
+        A body may have little inertia about its joints, such as a rod with a mass in its middle. Then rows of G are
+        nearly dependent in the metric of M, and a smallest pivot of 10^-k costs up to 2 k digits of accelerations. In
+        the metric of M + s G^T G, they are not. If s G^T G is 10^k times as large as M, k digits are lost, and
+        refinement restores them. `factors`: of the scales s of rows; `index`: choice.min_pivot is MIN_PIVOTS[index].
         """
         rows = G[list(choice.rows)]
         scale = 2.0 ** np.round(np.log2(ADDED_SIZE * np.abs(mass).max() / np.abs(rows).max() ** 2))
@@ -228,7 +227,7 @@ class PivotChooser:
         return replace(stiffened, min_pivot=float(MIN_PIVOTS[new_index]))
 
     def _decode(self, index: int) -> PivotChoice:
-        """Return the choice that the compiled search stored; `index`: its result; if this is < 0, raise Untraceable."""
+        """Return the choice that the compiled search stored; if its result `index` is < 0, M is singular: raise."""
         from twoloop.kernels.linalg.rank import STAYS_SINGULAR
 
         system, n_rows = self.system, self.system.n_c + self.system.n_a
@@ -254,12 +253,12 @@ def _nearby(system: ConstrainedSystem, t: float, q: Array) -> tuple[Array, Array
 
 
 def _scale_factors(singular: Sequence[int], mass: Array, G: Array) -> Array:
-    """Return a factor for each row of G; the scale of a row that is added to M is multiplied by its factor.
+    """Return a factor for each row g of G: if s g^T g is added to M, s is multiplied by it.
 
-    `singular`: rows that are added because M is singular. The factor is a negative power of SCALE_STEP if M is small in
-    all columns of the row, and each of these columns has an entry in one of the rows `singular`. Otherwise it is 1.
     Without the factor, a row on Euler parameters alone, such as their norm, would hide the small inertia of a body
-    beside heavy bodies.
+    beside heavy bodies. `singular`: rows that are added because M is singular. The factor is a negative power of
+    SCALE_STEP if M is small in all columns in which g has entries, and each of these columns has an entry in one of the
+    rows `singular`. Otherwise it is 1.
     """
     rows, covered = np.abs(G), np.any(G[list(singular)], axis=0)
     has_entry = rows > 0.0
@@ -267,13 +266,13 @@ def _scale_factors(singular: Sequence[int], mass: Array, G: Array) -> Array:
     own /= np.maximum(rows.max(axis=1, initial=0.0), np.finfo(float).tiny) ** 2
     ratio = own / (np.abs(mass).max() / rows.max() ** 2)
     smaller = (ratio > 0.0) & ~rows[:, ~covered].any(axis=1)
-    # 0.25 is added so that the factor is 1 for ratios down to SCALE_STEP ** -1.25, at which no digits are lost
+    # 0.25: the factor is 1 for ratios down to SCALE_STEP ** -1.25, which cost no digits
     steps = np.ceil(np.log(np.where(smaller, ratio, 1.0)) / np.log(SCALE_STEP) + 0.25)
     return np.asarray(SCALE_STEP ** np.minimum(steps, 0.0))
 
 
 def _hides_little_inertia(choice: PivotChoice, mass: Array, G: Array) -> bool:
-    """Return True if bodies of little inertia may lose digits: added rows have several scales, or a pivot is small."""
+    """Return True if light bodies may lose digits: rows are added to M with several scales, or a pivot is small."""
     if not choice.added_rows:
         return False
     added, scales = G[list(choice.added_rows)], np.array(choice.scales)
@@ -282,9 +281,9 @@ def _hides_little_inertia(choice: PivotChoice, mass: Array, G: Array) -> bool:
     return len(set(choice.scales)) > 1 or ratio > MAX_PIVOT_RATIO
 
 
-MAX_OPERATIONS = 60_000  # more operations of callbacks and elimination are refused; 40 bodies in space need fewer
-# `reduced_program` is compiled in addition if it costs at most this fraction of `mass_first_program`, which is needed
-# anyway where pivots are small. At a relative cost of 0.68 (four-bar), it saves 5 % of the time of a run
+MAX_OPERATIONS = 60_000  # no code is generated if the elimination takes more; 40 bodies in space need fewer
+# accelerations by elimination of dependent coordinates are compiled only if they cost less than this fraction of those
+# by the elimination that begins with M, which is always compiled. At 0.68 (four-bar), they save 5 % of a run's time
 MAX_COST_RATIO = 0.75
 
 
@@ -296,7 +295,7 @@ class Elimination:
 
     Fields:
     graph : graph of the operations; its first inputs are t, q and v.
-    redundant_rows : program without arrays; its conditions hold if the redundant constraints are satisfied.
+    redundant_rows : program that computes only conditions, which hold if the redundant constraints are satisfied.
     split_functions : generator that splits long equations into several functions; compile_equations.py sets it.
     n_operations : number of operations of callbacks and factorization, but not of the solution with the factors.
     traced : traces of the callbacks.
@@ -334,7 +333,7 @@ class Elimination:
         return elementwise(Affine.as_term, [self.equations.expressions(kind, v)])
 
     def _redundant_rows(self, rates: Any) -> Program:
-        """Return a program whose conditions hold if a state satisfies the redundant rows; `rates`: C_t, then b."""
+        """Return a program whose conditions hold if a state satisfies the redundant rows of C; `rates`: [C_t, b]."""
         redundant = [k for k in range(self.system.n_c) if k not in self.choice.rows]
         violations = self._callback_terms("constraint")
         unit, conditions = Affine(self.graph, 1.0, {}), []
@@ -370,7 +369,7 @@ class Elimination:
         return matrix
 
     def _solve(self, r: Sequence[Affine], c: Sequence[Affine]) -> tuple[list[Affine], list[tuple[Affine, Affine]]]:
-        """Return [a, lam] with M a + G^T lam = r, G a = c, and conditions, see `solve_refined`; c has all rows of G."""
+        """Return [a, lam] that solve M a + G^T lam = r, G a = c, and their conditions; c has entries for all rows."""
         return solve_refined(self.factors.solve, self.choice, self.mass, self.all_rows, r, c)
 
     def _right_sides(self, v: Sequence[Affine]) -> tuple[list[Affine], list[Affine]]:
@@ -415,13 +414,13 @@ class Elimination:
 
     @cached_property
     def right_sides(self) -> Program:
-        """Return the program for "r" = Q and "c", right-hand sides of G a = c; 0 for rows not in the equations."""
+        """Return the program for "r" = Q and "c", right-hand sides of G a = c; 0 for redundant rows not added to M."""
         force, gamma = self._right_sides(self.v)
         used = {*self.choice.rows, *self.choice.added_rows}
         return Program(self.graph, {"r": force, "c": [x if k in used else self.zero for k, x in enumerate(gamma)]})
 
     def _accelerations(self, v: Sequence[Affine]) -> tuple[list[Affine], list[tuple[Affine, Affine]]]:
-        """Return accelerations and multipliers (independent rows) at velocities v in one list, and their conditions."""
+        """Return accelerations at velocities v and multipliers of independent rows in one list, and conditions."""
         return self._solve(*self._right_sides(v))
 
     def _expand_to_all_rows(self, independent: Sequence[Affine]) -> list[Affine]:
@@ -433,13 +432,13 @@ class Elimination:
 
     @cached_property
     def position_errors(self) -> Program:
-        """Return the program for right sides "c" of position corrections: -C; 0 in redundant and non-holonomic rows."""
+        """Return the program for "c" in C_q (change of q) = c: -C, but 0 in redundant and non-holonomic rows."""
         errors = [*(-violation for violation in self._callback_terms("constraint")), *[self.zero] * self.system.n_a]
         return Program(self.graph, {"c": self._expand_to_all_rows([errors[k] for k in self.choice.rows])})
 
     @cached_property
     def velocity_errors(self) -> Program:
-        """Return the program for the right sides "c" = -G v - (C_t, b) of velocity corrections; 0 in redundant rows."""
+        """Return the program for "c" in G (change of v) = c: -(C_q v + C_t) and -(A v + b), but 0 in redundant rows."""
         errors = []
         for row, rate in zip(self.rows, self.rates, strict=True):
             total = rate
@@ -521,8 +520,8 @@ def multipliers_of_least_norm(
 class FactorAndSolvePrograms:
     """Programs that solve M a + G^T lam = r, G a = c in two steps: first the factors, then the solution with them.
 
-    other_programs : programs that run after the first step, at the same state. Quantities that they need, and that the
-        first step computes anyway, are stored, too.
+    other_programs : programs that run after the first step, at the same state. If the first step computes a quantity
+        that they need, it stores it, too.
     Fields:
     stored_indices : quantities that the first step stores. Keys: indices in the graph of `equations`; values: indices
         in the array of stored quantities, which begins with the factors.
@@ -586,7 +585,7 @@ class FactorAndSolvePrograms:
 
 
 def _shared_quantities(graph: Graph, factors: Sequence[int], other_programs: Sequence[Program]) -> list[int]:
-    """Return the quantities that are needed for `factors` and for `other_programs`, except `factors` themselves."""
+    """Return the quantities that are computed for `factors` and that `other_programs` need, except `factors`."""
     computed = set(graph.quantities_for(map(graph.quantity, factors)))
     used = {i for program in other_programs for expr in program.expressions for i in expr.terms}
     for program in other_programs:
