@@ -1,7 +1,7 @@
 """Record the operations of callbacks in a graph, and differentiate the recorded expressions.
 
-A value is an affine expression c + sum_i c_i x_i of quantities x_i. Quantities are the time, coordinates, velocities,
-and results of operations: products and functions of affine expressions. A repeated operation is recorded once.
+A callback runs on affine expressions c + sum_i c_i x_i of quantities x_i instead of numbers. Quantities are the time,
+coordinates, velocities, and results of operations: products and functions of affine expressions, each recorded once.
 """
 
 import math
@@ -22,11 +22,11 @@ from twoloop.generate.parameter_expressions import (
 from twoloop.generate.parameter_expressions import Untraceable as Untraceable
 from twoloop.kernels.evaluation import operations as op
 
-# derived programs and series with more operations are refused: to trace them would take longer than most runs
+# a derived callback or a Taylor series with more operations is not generated: this would take longer than most runs
 MAX_TRACED_OPERATIONS = 20_000
-# a product is recorded once for all its multiples: constant factors are taken out of both arguments. They stay in the
-# arguments if taking them out might underflow or overflow: if the magnitude of their product is not between MIN_FACTOR
-# and 1 / MIN_FACTOR, or for the squares that make up a power with an exponent above HIGH_EXPONENT
+# products that differ by a constant factor are recorded once: the factor is taken out. It stays in the arguments if the
+# result might underflow or overflow: if its magnitude is not between MIN_FACTOR and 1 / MIN_FACTOR, or in the squares
+# that make up a power with an exponent above HIGH_EXPONENT
 MIN_FACTOR, HIGH_EXPONENT = 1e-100, 8
 # reason in messages about a callback that compares an expression, or converts it to a number
 BRANCHING_REASON = "it branches on, or converts to a number, what depends on t, q or v"
@@ -45,8 +45,8 @@ CONVERSION_REASON = (
 class Graph(SymbolicObject):
     """Graph of quantities, numbered from 0: inputs (time, coordinates, velocities) and results of operations.
 
-    operations : for each quantity that is an input, None; for each other one, the kind of operation and its arguments
-        (the second may be None). The second argument of a logarithm or an arctangent is the divisor of its derivative.
+    operations : for each quantity, None if it is an input, else (kind of operation, first argument, second argument or
+        None). The second argument of a logarithm or an arctangent is the divisor in its derivative.
     input_sizes : number of inputs that each call of `inputs` has added.
     traced : results of traced callbacks: arrays of expressions by kind of callback.
     """
@@ -58,8 +58,8 @@ class Graph(SymbolicObject):
         self.input_masks: list[int] = []  # for each quantity, a bit mask of the inputs that it depends on
         self.traced: dict[str, Any] = {}
         self._recorded_quantities: dict[tuple[int, int, int], int] = {}
-        # rank of each factor of a product in the order of first use, by its `identifier`; a product begins with the
-        # factor of lower rank, so that the order of its factors does not depend on the values of parameters
+        # 0, 1, ... for factors of products in the order of first use (keys: `identifier`). A product begins with the
+        # factor used first, so that the order of its factors does not depend on the values of parameters
         self._factor_order: dict[int, int] = {}
         self._identifiers: dict[Any, int] = {}  # results of `identifier`, by keys of expressions
         self._quantities: dict[int, Affine] = {}
@@ -106,7 +106,7 @@ class Graph(SymbolicObject):
         return expr
 
     def identifier(self, expr: "Affine") -> int:
-        """Return an integer that is equal for expressions with equal keys, and faster to compare than the keys."""
+        """Return an integer that is the same for equal expressions, and faster to compare than their keys."""
         if expr.cached_identifier is None:
             expr.cached_identifier = self._identifiers.setdefault(expr.key, len(self._identifiers))
         return expr.cached_identifier
@@ -126,7 +126,7 @@ class Graph(SymbolicObject):
         return self.quantity(quantity)
 
     def quantities_for(self, exprs: Iterable["Affine"], available: Container[int] = ()) -> list[int]:
-        """Return the indices of operations that `exprs` need, except `available` ones; arguments precede results."""
+        """Return the indices of quantities to be computed for `exprs`, arguments first; `available` ones are known."""
         needed: set[int] = set()
         stack = [i for expr in exprs for i in expr.terms]
         while stack:
@@ -148,7 +148,7 @@ class Graph(SymbolicObject):
         return [expr for expr in (self.operations[i] or ())[1:] if isinstance(expr, Affine)]
 
     def quantities_by_use(self, exprs: Iterable["Affine"], available: Container[int] = ()) -> list[int]:
-        """Return the indices of `quantities_for` in depth-first order: quantities come close before their first use."""
+        """Return the same indices as `quantities_for`, but each quantity comes shortly before its first use."""
         order: list[int] = []
         needed: set[int] = set()
         stack = [i for expr in exprs for i in expr.terms][::-1]
@@ -164,7 +164,7 @@ class Graph(SymbolicObject):
         return order
 
     def product(self, a: "Affine", b: "Affine") -> "Affine":
-        """Return a * b: a number times the product of normalized a and b, which is recorded once for all multiples."""
+        """Return a * b, as a number times a product without constant factors, so that this product is recorded once."""
         if not a.terms:
             return b.times(a.constant)
         if not b.terms:
@@ -225,7 +225,7 @@ class Affine:
 
     @property
     def is_late(self) -> bool:
-        """Return whether the expression depends on inputs other than time and coordinates."""
+        """Return True if the expression depends on inputs other than time and coordinates."""
         return any(self.graph.is_late[i] for i in self.terms)
 
     def times(self, factor: float) -> "Affine":
@@ -266,7 +266,7 @@ class Affine:
         for i, c in other.terms.items():
             total = terms[i] + c if i in terms else c
             if _magnitude(total) <= CANCELLATION_LIMIT * _magnitude(c):
-                terms.pop(i, None)  # default None: if `total` is only c, which has underflowed to zero, no term exists
+                terms.pop(i, None)  # None: if total is c, and has underflowed to 0, there is no term
             else:
                 terms[i] = total
         if _equal(other.constant, 0.0):
@@ -462,12 +462,12 @@ def symbol_array(exprs: Iterable[Affine]) -> Any:
 
 
 def is_zero(expr: Affine) -> bool:
-    """Return whether an expression has no terms and the constant 0."""
+    """Return True if an expression has no terms and the constant 0."""
     return not expr.terms and expr.constant == 0.0
 
 
 class Derivative:
-    """Directional derivatives; keys of `direction`: indices of inputs; values: nonzero components of the direction."""
+    """Directional derivatives of expressions; `direction`: its nonzero components, by indices of inputs."""
 
     def __init__(self, graph: Graph, direction: dict[int, Affine]):
         self.graph = graph
@@ -483,7 +483,7 @@ class Derivative:
         return total
 
     def _differentiate_quantity(self, i: int) -> Affine:
-        """Return the derivative of quantity i; first, differentiate the quantities that it depends on."""
+        """Return the derivative of quantity i, after those of the quantities that it depends on."""
         stack = [i]  # no recursion, because products may be nested more deeply than Python's limit
         while i not in self._derivatives:
             op = self.graph.operations[stack[-1]]
