@@ -59,19 +59,17 @@ from twoloop.kernels.evaluation.inner_loop import (
 from twoloop.kernels.evaluation.partition import PARTITION_CHANGED
 from twoloop.kernels.linalg.dense import copy
 
-SUDDEN_ERROR = 10.0  # if a rejected step has a larger error, in tolerances, it is assumed that a force jumps within it
-MAX_RATIO_AFTER_REJECTION = 0.95  # largest ratio of the next step size to the size of a rejected step
-# a method on trial is given up if its steps are short, but not before this number of accepted steps, because the size
-# of the first step is a guess
-FIRST_JUDGED_STEP = 2
+SUDDEN_ERROR = 10.0  # a force is assumed to jump within a rejected step whose error, in tolerances, exceeds this
+MAX_RATIO_AFTER_REJECTION = 0.95  # the next step size is at most this times the size of a rejected step
+FIRST_JUDGED_STEP = 2  # a trial may end because a step is short, but not before this step: the first size is a guess
 
 
 @kernel(i8(KIT, WORK, f8, VECTOR))
 def start(f, w, t, state):
-    """Factorize M, choose the partition, and store a and lam in `state`; return DONE or a code for the failure."""
+    """Before the first step, choose the partition, and store a and lam in `state`; return DONE or a failure code."""
     n = w.Q.size
     q, v = state[:n], state[n : 2 * n]
-    w.last_jump = t  # a drive may start suddenly: treat t as a jump of the constraint rates C_t and b
+    w.last_jump = t  # a drive may start suddenly: treat t as the time of a jump of the constraint rates C_t and b
     code = prepare_mass(f, w, t, q)
     if code == DONE:
         code = renew_partition(f, w, t, q)
@@ -79,14 +77,15 @@ def start(f, w, t, state):
         code = find_tangents(f, w, t, q)
     if code == DONE:
         code = accelerations(f, w, t, q, v, state[2 * n : 3 * n], state[3 * n :])
-    if code == DONE and f.gamma_given == 0:  # repeat: the error test of Gamma needs its size, now known
+    # finite differences yield Gamma with an error relative to its size, which is known now: compute it again
+    if code == DONE and f.gamma_given == 0:
         code = accelerations(f, w, t, q, v, state[2 * n : 3 * n], state[3 * n :])
     return code
 
 
 @merged
 def _locate_rate_jump(f, w, t, size, tolerances, accepted, state, new_state):
-    """Return JUMP, RAMP or SMOOTH for C_t, b in a step (`accepted` or not), and the ends (s) of a jump or ramp."""
+    """Return how C_t and b change in a step (SMOOTH, RAMP: steep, or JUMP), and two times (s): ends of ramp or jump."""
     n = w.Q.size
     q, v = state[:n], state[n : 2 * n]
     if not accepted:
@@ -100,9 +99,9 @@ def _locate_rate_jump(f, w, t, size, tolerances, accepted, state, new_state):
 
 @merged
 def _attempt_step(f, w, options, memory, tolerances, control, clock, t, size, crosses_jump, state, new_state):
-    """Attempt a step; return DONE or another code, the error in tolerances, and next size / `size` (0: not known).
+    """Attempt a step; return a code (DONE: no failure), the error in tolerances, and next size / `size` (0: unknown).
 
-    If `crosses_jump`, the step only crosses a jump of C_t or b: `new_state` already contains the state after the jump.
+    If `crosses_jump`, do not compute: `new_state` already contains the state after a jump of C_t or b.
     """
     w.orientation_new = 0.0
     if clock[at.FAILURE_CODE] == DONE:
@@ -125,10 +124,10 @@ def _attempt_step(f, w, options, memory, tolerances, control, clock, t, size, cr
 
 @merged
 def _must_repeat_at_jump(f, w, tolerances, control, clock, t, size, accepted, state, new_state):
-    """Return True if a step (`accepted` or not) must be repeated because C_t or b jumps or has a steep ramp in it.
+    """Return True if a step must be repeated, so that it ends at a jump or steep ramp of C_t or b within it.
 
-    For a jump, store the times just before and after it in clock[JUMP_FROM] and clock[JUMP_TO]. For a ramp, store the
-    next step size in clock[H_NEXT].
+    For a jump, store the times just before and after it in clock[JUMP_FROM] and clock[JUMP_TO]. For a ramp, which
+    matters only if the step was `accepted`, store the next step size in clock[H_NEXT].
     """
     kind, low, high = _locate_rate_jump(f, w, t, size, tolerances, accepted, state, new_state)
     if kind == JUMP:
@@ -176,9 +175,10 @@ def _handle_failure(f, w, control, clock, t, size, code, t_repeated, state):
 
 @merged
 def _handle_rejection(f, w, control, clock, t, size, proposed_size, state):
-    """After a step with too large an error, store the next, smaller size in clock[H_NEXT] and return CONTINUE.
+    """After a step with too large an error, store the size (s) of its repetition in clock[H_NEXT]; return CONTINUE.
 
-    If a singular position is near, return an end code. `proposed_size`: next size (s) according to the error.
+    Return an end code instead if the step is short and a singular position is near. `proposed_size`: size (s) that the
+    error allows.
     """
     n = w.Q.size
     w.n_rejected_error += 1
@@ -195,7 +195,7 @@ def _handle_rejection(f, w, control, clock, t, size, proposed_size, state):
 
 @merged
 def _can_take_many_steps(control, clock):
-    """Return True if the method may take many steps in one call, without checks by `advance` between them."""
+    """Return True if the method may now take many steps in one call, without checks by `advance` between them."""
     if control[at.TAKES_MANY] == 0.0 or control[at.FIXED_STEP] > 0.0 or clock[at.APPLIES_JUMP] == 1.0:
         return False
     if control[at.SPACING] > 0.0 or clock[at.T] == clock[at.JUMP_FROM]:
@@ -205,7 +205,7 @@ def _can_take_many_steps(control, clock):
 
 @merged
 def _pass_output_time(f, w, clock, outputs, state):
-    """Record the smallest pivot at an output time; go on to the next output time; return True if none is left."""
+    """Update clock[PIVOT_AT_OUTPUT] and clock[NEXT_OUTPUT] at an output time; return True if it was the last one."""
     record_pivot_at_output(f, w, clock, state)
     clock[at.NEXT_OUTPUT] += 1.0
     return int(clock[at.NEXT_OUTPUT]) == outputs.size
@@ -220,8 +220,8 @@ def advance(
 ):
     """Integrate from clock[T] and `state` to the last time in `outputs`; return an end code, see loop_state.py.
 
-    - Update `clock` and `state` in place. `new_state` is scratch; but if clock[APPLIES_JUMP] is 1, the next step
-      crosses a jump of C_t or b, and `new_state` contains the state after the jump.
+    - Update `clock` and `state` in place. `new_state` is scratch; but if clock[APPLIES_JUMP] is 1, the caller has
+      stored the state after a jump of C_t or b in it, and the first step ends there.
     - Shorten steps so that they end at output times. A step size is the difference of two floating-point times, so that
       step sizes add up to the exact time.
     - Store times and states in out_t and out_state: after each accepted step if control[STORE_ALL] is 1, otherwise at
@@ -270,7 +270,7 @@ def advance(
         target = outputs[int(clock[at.NEXT_OUTPUT])]
         goal = min(target, clock[at.JUMP_TO] if jumps else clock[at.JUMP_FROM])
         h = control[at.FIXED_STEP] if fixed_size else min(clock[at.H_NEXT], clock[at.H_LIMIT], control[at.MAX_STEP])
-        n_grid_steps = 1.0  # for steps of fixed size: number (0 or 1) of grid times that this step reaches
+        n_grid_steps = 1.0  # number (0 or 1) of grid times T_START + k h (steps of fixed size h) that this step reaches
         if fixed_size:
             size, n_grid_steps, reaches_goal = size_on_grid(clock, t, h, target, goal)
         else:
@@ -295,7 +295,7 @@ def advance(
         if w.time_is_up == 1.0:  # the time limit has passed, perhaps within this attempt: discard it
             f.commit(f, w, options, memory, tolerances, False)
             return at.PAUSED
-        # near a jump of a force the error estimate may be too small: up to the time JUMP_END, multiply it by JUMP_RATIO
+        # near a jump of a force, the error estimate may be too small: multiply it by JUMP_RATIO up to the time JUMP_END
         error_factor = control[at.JUMP_RATIO] if t < clock[at.JUMP_END] else 1.0
         accepted = code == DONE and error * error_factor <= 1.0
         if accepted and not reaches_goal and ends_near_singular(f, w, control, clock):
@@ -361,7 +361,7 @@ def advance(
             out_t[filled[0]] = clock[at.T]
             copy(state, out_state[filled[0]])
             filled[0] += 1
-        # if this step was shortened, for example to end at an output time, the next one may be as long as was intended
+        # if this step was shortened, for example to end at an output time, the next one may have the intended size, h
         clock[at.H_NEXT] = max(proposed_size, h) if shortened else proposed_size
         clock[at.LIMIT_AGE] += 1.0
         if clock[at.LIMIT_AGE] > control[at.LIMIT_MEMORY]:
