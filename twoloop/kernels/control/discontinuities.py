@@ -4,22 +4,20 @@ C_t is the time derivative of the constraints C; b belongs to non-holonomic cons
 the equations at its stages only, and may miss a force that acts between two stages. So forces, C_t and b are sampled
 ahead of the step (`f`: kit, `w`: workspace), which costs less than evaluations of the equations.
 
-- First, the straight line from the first to the last sample is subtracted. A force, C_t or b is smooth if the second
-  differences of its samples are then small relative to the range of the samples. A change within one or two samples
-  makes second differences as large as the range. The step must end at such a change, or where a value is not finite.
-- If forces may change suddenly with position or velocity, and steps are longer than the spacing of samples, samples are
-  taken along the motion, extrapolated by a parabola from the present position, velocity and acceleration. One set of
-  samples serves one long step, or all short steps that end within MIN_TIME_AHEAD spacings.
-- All other samples are taken with q and v fixed, as they are where the step begins. Their spacing is also limited to a
-  fraction of the step size.
-- The shortest time between two changes, and the shortest duration of a change within a short step, are recorded. If the
-  spacing of samples is not much smaller than this, other changes as short may have been missed: a message says so.
+- The straight line from the first to the last sample is subtracted. A change is sudden if a second difference of the
+  samples exceeds a tenth of their range. The step must end at such a change, or where a value is not finite.
+- If forces may change suddenly with position or velocity, and steps are longer than the time between samples, samples
+  are taken along the motion, extrapolated by a parabola from the present position, velocity and acceleration.
+- All other samples are taken with q and v fixed, as they are where the step begins. The time between them is also
+  limited to a fraction of the step size.
+- The shortest time between two changes, and the shortest duration of a pulse within a short step, are recorded. If the
+  time between samples is not much shorter, other changes as short may have been missed: a message says so.
 
 A jump of C_t or b, for example at the end of a ramp in a drive, changes velocities as an impulse does. Methods that
 correct only dependent velocities after the jump would violate the balance of momentum. So, if velocities change in a
-step by more than accelerations explain, C_t and b are sampled at thirteen times in the step. If they are smooth on the
-scale of the step, the twelfth difference of these samples is almost zero, and falls by 2^12 if the span is halved.
-If C_t or b jumps, the difference is as large as the jump, also in that half of the time span that contains the jump.
+step by more than accelerations explain, C_t and b are sampled at thirteen times in the step. If they are smooth, the
+twelfth difference of these samples is almost zero, and falls by 2^12 if the time span is halved. If C_t or b jumps, it
+is as large as the jump, also in that half of the time span that contains the jump.
 """
 
 import numpy as np
@@ -32,33 +30,33 @@ from twoloop.kernels.evaluation.constraints import constraint_rates, representab
 from twoloop.kernels.linalg.dense import largest_of
 from twoloop.kernels.linalg.symbolic_factorization import jacobian_entries_of
 
-N_PARTS = 12  # C_t and b are sampled at the ends of this number of equal parts of a time span
-# coefficients of the thirteen samples in the twelfth difference
+N_PARTS = 12  # number of equal parts of a time span; C_t and b are sampled at their ends, at 13 times
+# factors of these 13 samples in their twelfth difference
 BINOMIAL = (1.0, -12.0, 66.0, -220.0, 495.0, -792.0, 924.0, -792.0, 495.0, -220.0, 66.0, -12.0, 1.0)
 MAX_BISECTIONS = 60  # largest number of bisections that locate a jump or a ramp of C_t or b
 RATE_ROUNDING = 1e-11  # error of the twelfth difference due to rounding of samples, relative to the largest sample
 TIME_ROUNDING = 5e3  # error of the twelfth difference due to rounding of t, relative to np.spacing(t) * (mean slope)
 STEEPNESS = 4.0  # a part of a step is a ramp if C_t or b is this number of times steeper there than in the whole step
-MAX_RAMP_SHARE = 0.125  # a step must end at a ramp of C_t or b that takes at most this fraction of the step
-MIN_SPACINGS = 8.0  # bisection ends at a time span of this number of spacings of floating-point numbers
-SMOOTH, RAMP, JUMP = range(3)  # results of locate_discontinuity for C_t and b in a time span
+MAX_RAMP_SHARE = 0.125  # only a ramp of C_t or b that takes at most this fraction of a step is located within the step
+MIN_SPACINGS = 8.0  # bisection for a jump ends at a time span of this number of spacings of floating-point numbers
+SMOOTH, RAMP, JUMP = range(3)  # C_t and b in a time span: smooth, or with a steep ramp or a kink, or with a jump
 
 
 @compiled
 def _sample_rates(f, w, t, q, velocity, begin, end):
-    """Store C_t and b (of A v + b = 0) at 13 times from `begin` to `end`, at q + velocity (time - t), in w.rates."""
+    """Store C_t and b at 13 times from `begin` to `end` in w.rates, at the positions q + velocity * (time - t)."""
     for k in range(N_PARTS + 1):
         time = end if k == N_PARTS else begin + (end - begin) * (k / N_PARTS)
         for m in range(q.size):
             w.x[m] = q[m] + (time - t) * velocity[m]
         constraint_rates(f, w, time, w.x, w.rates[k])
-        if not finite_vector(w.rates[k]):  # such as d|t|/dt at t = 0: take the next floating-point time
+        if not finite_vector(w.rates[k]):  # for example d|t|/dt at t = 0: sample at the next floating-point time
             constraint_rates(f, w, time + np.spacing(abs(time)), w.x, w.rates[k])
 
 
 @compiled
 def _twelfth_difference(w, row):
-    """Return |twelfth difference| of component `row` of (C_t, b), from its samples w.rates[:, row]."""
+    """Return |twelfth difference| of the samples w.rates[:, row] of one component of (C_t, b)."""
     total = 0.0
     for k in range(N_PARTS + 1):
         total += BINOMIAL[k] * w.rates[k, row]
@@ -67,7 +65,7 @@ def _twelfth_difference(w, row):
 
 @compiled
 def _slope_and_size(w, row, length):
-    """Return the mean |slope| (per s) and the largest |value| of the samples w.rates[:, row], taken over `length` s."""
+    """Return the mean |slope| (per s) and the largest |value| of the samples w.rates[:, row], which span `length` s."""
     change = 0.0
     largest = abs(w.rates[0, row])
     for k in range(N_PARTS):
@@ -78,7 +76,7 @@ def _slope_and_size(w, row, length):
 
 @compiled
 def _allowed_error(f, w, tolerances, x, row):
-    """Return the allowed error of (G x)[row]: max over j of |G[row, j]| times the tolerance of x[j]; G: Jacobian."""
+    """Return how far entry `row` of G x (G: Jacobian) changes at most if one velocity in x changes by its tolerance."""
     largest = 0.0
     if f.form == FIXED_ORDER:
         rows, columns, _ = jacobian_entries_of(f.ldl_program)
@@ -106,11 +104,11 @@ def unexplained_velocity_change(tolerances, h, state, new_state, n):
 
 @compiled
 def locate_discontinuity(f, w, t, end, q, v, velocity, tolerances):
-    """Return SMOOTH, RAMP or JUMP for the least smooth component of (C_t, b) from t to `end`, and two times (s).
+    """Search the least smooth of C_t and b from t to `end`; return SMOOTH, RAMP or JUMP, and two times (s).
 
-    The times are the ends of the jump or ramp; t and `end` if all is smooth. If a ramp fills the step, they are the
-    ends of the first half of the step: a method that evaluates accelerations only at the ends of a ramp, where they may
-    be zero, would miss the ramp. (q, v): state at t. C_t and b are sampled at positions q + velocity (time - t).
+    The times are the ends of the jump or ramp; t and `end` if all is smooth. If a ramp fills the time span, they are
+    the ends of its first half: a method that evaluates accelerations only at the ends of a ramp, where they may be
+    zero, would miss the ramp. (q, v): state at t. C_t and b are sampled at positions q + velocity * (time - t).
     """
     begin = t
     h = end - t
@@ -118,7 +116,7 @@ def locate_discontinuity(f, w, t, end, q, v, velocity, tolerances):
     row, limit, mean, largest = -1, 0.0, 0.0, 1.0
     for i in range(w.Rate.size):
         difference = _twelfth_difference(w, i)
-        if difference == 0.0:  # this component does not depend on time
+        if difference == 0.0:  # this component is constant
             continue
         slope, size = _slope_and_size(w, i, h)
         error_limit = max(
@@ -158,36 +156,36 @@ def locate_discontinuity(f, w, t, end, q, v, velocity, tolerances):
     return SMOOTH, t, t + h
 
 
-N_SAMPLES = 20  # number of spacings between the samples of one set, which therefore has 21 samples
-MIN_TIME_AHEAD = 12.0  # shortest time over which the motion is sampled ahead, in units of control[SPACING]
+N_SAMPLES = 20  # number of time intervals between the 21 samples of one set
+MIN_TIME_AHEAD = 12.0  # samples along the motion extend at least over this number times control[SPACING], in s
 SUDDEN_RATIO = 0.1  # a change is sudden if the second difference exceeds this fraction of the range of the samples
-# changes of a force, C_t or b are ignored if the range of the samples is at most LEAST_RANGE * rtol times the largest
-# value so far, or at most LEAST_VALUE, because squares of smaller values underflow
+# a force, C_t or b counts as constant if its samples differ by at most LEAST_RANGE * rtol times the largest value so
+# far, or by at most LEAST_VALUE, because squares of smaller numbers underflow
 LEAST_RANGE, LEAST_VALUE = 0.1, 1e-150
 MIN_SAMPLES_IN_STEP = 8.0  # least number of samples in a step: all stages may miss a force that lasts a quarter of it
-RESAMPLE_BELOW = 0.25  # times ahead are sampled again if the spacing must be below this fraction of the last spacing
-MIN_SPACING = 16.0  # smallest spacing of samples, in spacings of floating-point numbers at t
+RESAMPLE_BELOW = 0.25  # sample again if the time between samples must be below this fraction of its last value
+MIN_SPACING = 16.0  # shortest time between samples, in spacings of floating-point numbers at t
 N_BISECTIONS = 20  # number of bisections that locate the time of a change between two samples
-EQUAL_CHANGES = 1e-5  # two changes count as one if they are at most this fraction of the widest sample spacing apart
+EQUAL_CHANGES = 1e-5  # two changes are the same if their times differ by at most this part of clock[WIDEST_SAMPLING]
 # changes are not recorded until this time after the start, in units of tolerances[GAP]: just after the start, rounding
 # errors make a force that begins at zero, such as 1 - cos(t), seem to change suddenly
 MIN_RECORDED_TIME = 5e-5
 MIN_STEEPNESS_RATIO = 2.0  # a change between two samples is sudden if it exceeds this times the changes next to it
-SHORT_STEP = 0.5  # steps below this fraction of the longest of the last steps may be short because of a discontinuity
-N_SAMPLES_IN_SHORT_STEP = 4  # number of samples within a short step
-# accelerations do not last (see _acceleration_lasts) if an acceleration changes by more than this fraction of the
-# largest acceleration when velocities change by their tolerances
+SHORT_STEP = 0.5  # a step below this fraction of the longest recent step may be short because of a pulse: search for it
+N_SAMPLES_IN_SHORT_STEP = 4  # number of samples within a short step, in search of pulses
+# accelerations do not last if one of them changes by more than this fraction of the largest, when velocities change by
+# their tolerances, see `_acceleration_lasts`
 MAX_LASTING_CHANGE = 0.5
-CHANGE_MARGIN = 0.01  # a change at most this number of sample spacings after the beginning of a step counts as passed
-# rows of w.changes, whose columns are the forces, C_t and b: rows 0 to N_SAMPLES are the samples of one set
-LARGEST_ROW = N_SAMPLES + 1  # largest |value| of each column so far
-MIDDLE_ROW = N_SAMPLES + 2  # values at a time between two samples
+CHANGE_MARGIN = 0.01  # a change counts as passed up to this part of the time between samples after a step's beginning
+# w.changes has a column for each force, C_t and b; its rows 0 to N_SAMPLES contain the samples of one set
+LARGEST_ROW = N_SAMPLES + 1  # row of w.changes: largest |value| of each force, C_t and b so far
+MIDDLE_ROW = N_SAMPLES + 2  # row of w.changes: one more sample, at a time between or before the samples of the set
 N_CHANGES = N_SAMPLES + 3  # number of rows of w.changes
 
 
 @compiled
 def _sample_forces(f, w, time, elapsed, q, v, a, values):
-    """Store forces, C_t and b at `time` in `values`, for the state `elapsed` s after (q, v) with constant a."""
+    """Store forces, C_t and b at `time` in `values`; (q, v) moves for `elapsed` s with constant accelerations a."""
     for m in range(q.size):
         w.x[m] = q[m] + elapsed * (v[m] + 0.5 * elapsed * a[m])
         w.y[m] = v[m] + elapsed * a[m]
@@ -198,14 +196,14 @@ def _sample_forces(f, w, time, elapsed, q, v, a, values):
 
 @compiled
 def _least_ranges(tolerances, largest, n):
-    """Return the largest ranges of samples for which changes are ignored: one for the n forces, one for C_t and b."""
+    """Return two limits, for forces and for C_t and b: samples that differ less count as constant, see LEAST_RANGE."""
     least = LEAST_RANGE * tolerances[RTOL]
     return max(LEAST_VALUE, least * largest_of(largest[:n])), max(LEAST_VALUE, least * largest_of(largest[n:]))
 
 
 @compiled
 def _is_smooth_bend(values, k, n):
-    """Return True if values[0] to values[n] have similar second differences at k and beside k, like a smooth curve."""
+    """Return True if samples 0 to n have second differences with the same sign and a similar size at k and beside k."""
     second_value = k + 1 if k + 2 <= n else k - 1
     if second_value < 1:
         return False
@@ -216,11 +214,10 @@ def _is_smooth_bend(values, k, n):
 
 @compiled
 def _find_sudden_bend(values, n, slope, min_range, strict):
-    """Return the index of the first sudden bend of n + 1 values (0: no sudden bend), and a limit.
+    """Return the index of the first sudden bend of n + 1 samples (0: none), and the limit that its size exceeds.
 
-    At a sudden bend, the second difference exceeds the limit: SUDDEN_RATIO times the range of the values after a line
-    of slope `slope` (per sample) is subtracted. If this range is at most `min_range`, no bend counts as sudden. If
-    `strict`, neither do bends of a smooth curve, see `_is_smooth_bend`.
+    Size: |second difference|. Limit: SUDDEN_RATIO times the range of the samples after a line with `slope` (per sample)
+    is subtracted. If this range is at most `min_range`, no bend is sudden. `strict`: skip bends of smooth curves.
     """
     low = high = 0.0
     for k in range(1, n + 1):
@@ -240,10 +237,10 @@ def _first_sudden_bend(values, n, detrends, min_range):
     """Search n + 1 samples by `_find_sudden_bend`; return the index of the first sudden bend (0: none), and the limit.
 
     After a bend is found, search the samples before it, until there is no earlier bend. If `detrends` is 1, subtract
-    the straight line from the first to the last sample in each search; if it is 0, subtract nothing.
+    the straight line from the first to the last sample searched; if it is 0, subtract nothing.
     """
     index, limit = _find_sudden_bend(values, n, detrends * (values[n] - values[0]) / max(n, 1), min_range, False)
-    while index > 1:  # strict = True, because a few samples of a smooth curve may bend as much as a jump
+    while index > 1:  # strict = True below, because a few samples of a smooth curve may bend as much as a jump
         slope = detrends * (values[index] - values[0]) / index
         earlier, bound = _find_sudden_bend(values, index, slope, min_range, True)
         if earlier == 0:
@@ -254,7 +251,7 @@ def _first_sudden_bend(values, n, detrends, min_range):
 
 @compiled
 def _is_sudden_change(previous, first_value, second_value, following, limit):
-    """Return True if two successive samples differ by more than `limit`, and much more than from their neighbours."""
+    """Return True if the two middle samples of four differ by more than `limit`, and much more than from the others."""
     change = second_value - first_value
     sign = 1.0 if change > 0.0 else -1.0
     neighbouring_change = max(sign * (first_value - previous), sign * (following - second_value))
@@ -263,7 +260,7 @@ def _is_sudden_change(previous, first_value, second_value, following, limit):
 
 @compiled
 def _locate_change(f, w, low, high, k, j, q, v, a):
-    """Return the time (s) just after column j of w.changes changes between samples k (at `low`) and k + 1 (`high`)."""
+    """Return the time just after a force, C_t or b (column j) jumps between samples k (time low) and k + 1 (high)."""
     changes = w.changes
     before, after = changes[k, j], changes[k + 1, j]
     for _ in range(N_BISECTIONS):
@@ -279,17 +276,18 @@ def _locate_change(f, w, low, high, k, j, q, v, a):
 
 @compiled
 def _record_changes(f, w, tolerances, clock, t, begin, spacing, n, index, column, limit, q, v, a):
-    """Record sudden changes on both sides of sample `index`, where column `column` of w.changes has a sudden bend.
+    """Record sudden changes just before and after sample `index`, where a force, C_t or b has a sudden bend.
 
     Store the time of the last change in clock[LAST_CHANGE], and the shortest time between two changes in
-    clock[SHORTEST_CHANGE]. Sample k (0 to n) is at begin + k spacing. Differences up to `limit` are not sudden.
+    clock[SHORTEST_CHANGE]. Samples k = 0 to n, at begin + k * spacing, are in this `column` of w.changes. Differences
+    of samples up to `limit` are not sudden.
     """
     values, margin = w.changes[:, column], max(CHANGE_MARGIN * spacing, EQUAL_CHANGES * clock[at.WIDEST_SAMPLING])
     first_recorded_time = clock[at.T_START] + MIN_RECORDED_TIME * tolerances[GAP]
     for k in range(index - 1, index + 1):
         low, high = begin + k * spacing, begin + (k + 1) * spacing
         is_recorded = low - margin <= clock[at.LAST_CHANGE] <= high + margin
-        # skip a known change, and a change without samples on both sides
+        # skip a change that is already recorded, one without a later sample to compare, and one just after the start
         if is_recorded or k + 2 > n or low - spacing < first_recorded_time:
             continue
         if k == 0:
@@ -303,7 +301,7 @@ def _record_changes(f, w, tolerances, clock, t, begin, spacing, n, index, column
 
 @compiled
 def first_discontinuity(f, w, tolerances, clock, t, begin, spacing, last, follows_motion, q, v, a):
-    """Take a set of samples of forces, C_t and b; return the times of the first sudden change and the last sample.
+    """Take a set of samples of forces, C_t and b; return the times (s) of the first sudden change and the last sample.
 
     If there is no sudden change, its time is infinite. (q, v, a): state at t. The first sample is at `begin`, the
     last one not after `last`. follows_motion: 1: samples along the extrapolated motion; 0: at the fixed state (q, v).
@@ -339,7 +337,11 @@ def first_discontinuity(f, w, tolerances, clock, t, begin, spacing, last, follow
 
 @compiled
 def _record_short_change(f, w, tolerances, control, clock, t, size, last, q, v, a):
-    """Update clock[SHORTEST_CHANGE] by changes within a short step that earlier samples missed; sample until `last`."""
+    """Search a short step for pulses: values of a force, C_t or b far outside those before and after the step.
+
+    If the duration of a pulse (s) is the shortest so far, store it in clock[SHORTEST_CHANGE]. No sample is after the
+    time `last`.
+    """
     changes, spacing, begin, end = w.changes, control[at.TIME_SPACING], clock[at.T_START], t + size
     clock[at.COMPARED] = t
     if end + spacing > last or (t - 2.0 * spacing < begin and end + 2.0 * spacing > last):
@@ -366,7 +368,7 @@ def _acceleration_lasts(f, w, tolerances, t, duration, q, v, a, Q, V, A):
     """Return True if accelerations hardly change when velocities change by their tolerances.
 
     They change much if stiff friction holds a body: the accelerations are then rounding errors of balanced forces, and
-    extrapolating the motion with them would lead far from rest. (Q, V, A) is scratch.
+    must not be used to extrapolate the motion over `duration` (s). (Q, V, A) is scratch.
     """
     n, time, largest, change = w.Q.size, duration, 0.0, 0.0
     for m in range(n):
@@ -386,9 +388,9 @@ def _acceleration_lasts(f, w, tolerances, t, duration, q, v, a, Q, V, A):
 
 @compiled
 def _sample_motion(f, w, tolerances, control, clock, spacing, t, size, last, q, v, a, Q, V, A):
-    """Sample forces, C_t and b along the motion; store the time of the next sudden change in `clock`.
+    """If earlier samples along the motion end within the step, take new ones; store the next sudden change in `clock`.
 
-    The samples extend over the step size, or over MIN_TIME_AHEAD times `spacing` if longer, but not beyond `last`.
+    They extend from t over the step size, or over MIN_TIME_AHEAD times `spacing` if longer, but not beyond `last`.
     """
     if clock[at.MOTION_SAMPLED_TO] >= t + (1.0 - CHANGE_MARGIN) * size:
         return
@@ -403,7 +405,7 @@ def _sample_motion(f, w, tolerances, control, clock, spacing, t, size, last, q, 
             f, w, tolerances, clock, t, t, duration / N_SAMPLES, last, 1.0, q, v, A
         )
     clock[at.SAMPLES_MOTION] = 0.0
-    # close samples along the motion replace samples at a fixed state, unless the latter end at a sudden change
+    # samples along the motion, if close enough, also replace those at a fixed state, unless these end at a change
     change_found = clock[at.SAMPLED_TO] == clock[at.DISCONTINUITY] > t
     if not change_found and duration <= N_SAMPLES * min(control[at.TIME_SPACING], size / MIN_SAMPLES_IN_STEP):
         clock[at.WIDEST_SAMPLING] = max(clock[at.WIDEST_SAMPLING], duration / N_SAMPLES)
@@ -416,16 +418,18 @@ def _sample_motion(f, w, tolerances, control, clock, spacing, t, size, last, q, 
 
 @compiled
 def _sample_ahead(f, w, tolerances, control, clock, next_change, t, size, last, q, v, a):
-    """Sample forces, C_t and b at fixed q, v until `last`; return `next_change`, or the time of an earlier change."""
+    """Sample forces, C_t and b in a step from t, but not after `last`, with q and v fixed.
+
+    Return the time of the next sudden change: `next_change`, known before (infinite: none), or an earlier change.
+    """
     max_spacing = max(min(control[at.TIME_SPACING], size / MIN_SAMPLES_IN_STEP), MIN_SPACING * np.spacing(abs(t)))
-    # times that have been sampled before are sampled again if samples must be closer now. This is not necessary for
-    # multistep methods (JUMP_RATIO = 1), whose error estimates show a jump; nor if C_t or b may jump (MAY_JUMP = 1):
-    # then each step is checked for jumps
+    # times that have been sampled before are sampled again if samples must be much closer now. Not so for multistep
+    # methods (JUMP_RATIO = 1), whose error estimates show a jump, nor if each step is checked for jumps (MAY_JUMP = 1)
     may_resample = control[at.JUMP_RATIO] > 1.0 and control[at.MAY_JUMP] == 0.0
     if may_resample and max_spacing < RESAMPLE_BELOW * clock[at.SAMPLED_EVERY]:
         clock[at.SAMPLED_TO] = t
     begin = max(t, clock[at.SAMPLED_TO])
-    is_at_change = clock[at.DISCONTINUITY] == clock[at.SAMPLED_TO]  # a change that only close samples show again
+    is_at_change = clock[at.DISCONTINUITY] == clock[at.SAMPLED_TO]  # at a change, sample as closely as before it
     while begin < min(t + size, last, next_change):
         spacing, is_at_change = min(max_spacing, clock[at.SAMPLED_EVERY]) if is_at_change else max_spacing, False
         clock[at.WIDEST_SAMPLING] = max(clock[at.WIDEST_SAMPLING], spacing)

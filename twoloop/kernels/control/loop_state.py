@@ -1,21 +1,21 @@
 """Indices into `control` and `clock`, the arrays of the integration loop, and the codes that `advance` returns.
 
-`control` contains the settings of the loop; its first entries are the parameters of step-size control. `clock` contains
-the state of the loop, such as the present time. Each call of `advance` (kernels/advance.py) continues from this state.
-The first entries of `clock` are the history of step-size control.
+`advance` (kernels/advance.py) is the loop over steps. `control` contains its settings; the first entries are the
+parameters of step-size control. `clock` contains its state, such as the present time, from which the next call of
+`advance` continues; the first entries are the history of step-size control.
 """
 
 import numpy as np
 from numpy.typing import NDArray
 
-# end codes: the reasons why `advance` returns
+# end codes: reasons why `advance` returns
 (
     ALL_OUTPUT_DONE,  # the last output time is reached
     PAUSED,  # an array of results is full, or the call has attempted MAX_ATTEMPTS steps: call `advance` again
     STEP_TOO_SMALL,  # the size of the next step would be at most the limit, control[SHORTEST]
     FIXED_STEP_FAILED,  # a step of fixed size failed
     RANK_LOST,  # C_q has lost rank: no partition can be chosen
-    MAX_STEPS_REACHED,
+    MAX_STEPS_REACHED,  # the number of accepted steps has reached control[MAX_STEPS]
     ROWS_VIOLATED,  # constraints that counted as redundant are violated at the end of a step
     NEAR_SINGULAR,  # a singular position is near: the caller crosses it by special steps
     SWITCH_METHOD,  # the method does not suit the motion: the caller continues with another method
@@ -26,11 +26,11 @@ from numpy.typing import NDArray
 SUSPENDED = 0.5  # value of control[MAY_CROSS] after a singular position could not be crossed: ordinary steps go on
 CONTINUE = -1  # value that functions return in place of an end code if the loop goes on
 
-# indices of the parameters of step-size control. The next step size is SAFETY * error**-EXPONENT times the size of this
-# step (`error`: of this step, in tolerances), but at least FACTOR_MIN and at most FACTOR_MAX times this size. If
-# LEAST_ERROR > 0, the error of the previous step, at least LEAST_ERROR, also counts (Hairer & Wanner II, IV.8)
+# indices of the N_RULE parameters of step-size control. The next step size is SAFETY * error**-EXPONENT times the size
+# of this step (`error`: of this step, in tolerances), but FACTOR_MIN times this size at least and FACTOR_MAX times at
+# most. If LEAST_ERROR > 0, the error of the previous step, at least LEAST_ERROR, also counts (Hairer & Wanner II, IV.8)
 SAFETY, EXPONENT, FACTOR_MIN, FACTOR_MAX, LEAST_ERROR, N_RULE = range(6)
-# indices of the history of step-size control: size (s) and error (in tolerances) of the last accepted step
+# indices of the N_PAST numbers in the history: size (s) and error (in tolerances) of the last accepted step
 H_BEFORE, ERROR_BEFORE, N_PAST = range(3)
 
 # indices in `control`, after the parameters of step-size control
@@ -42,34 +42,33 @@ H_BEFORE, ERROR_BEFORE, N_PAST = range(3)
     LIMIT_MEMORY,  # number of accepted steps after which clock[H_LIMIT] becomes LIMIT_START again
     MAX_STEPS,  # largest number of accepted steps
     STORE_ALL,  # 1: the states after all accepted steps are stored; 0: only states at output times
-    SYMMETRIC,  # 1: each step chooses a partition at its midpoint; 0: it is kept until `partition_is_poor` is True
+    SYMMETRIC,  # 1: each step chooses the partition at its midpoint; 0: a partition is kept as long as it is good
     MAX_ATTEMPTS,  # number of attempted steps after which `advance` returns; its caller then checks progress and time
-    # 1: near a singular position, `advance` returns NEAR_SINGULAR, and the caller crosses the position. 0: never.
-    # SUSPENDED: not near the present singular position; far from this position, the value becomes 1 again
+    # 1: near a singular position, `advance` returns NEAR_SINGULAR, and the caller crosses the position. 0: `advance`
+    # never does so. SUSPENDED: not near the present singular position; far from this position, it becomes 1 again
     MAY_CROSS,
     SHORTEST,  # steps must be longer than this (s), and longer than EQUAL_SPACINGS spacings of floating-point times
     MAY_SWITCH,  # 1: `advance` returns SWITCH_METHOD if a value is not finite, or a step returns UNSUITED; 0: never
-    # a method on trial is judged in this number of steps (-1: no trial): if the size of a next step is at most
-    # tolerances[GAP], `advance` returns SWITCH_METHOD
+    # a method on trial is given up in one of its first TRIAL_STEPS steps (`advance` returns SWITCH_METHOD) if the next
+    # step size is at most tolerances[GAP], the longest allowed time between evaluations; -1: no method is on trial
     TRIAL_STEPS,
     MAY_JUMP,  # 1: a constraint rate, C_t or b (in A v + b = 0), may jump; 0: constraint rates are continuous
     JUMP_RATIO,  # largest ratio of a step's true error to its error estimate if a force jumps within the step
     SPACING,  # time (s) between samples of the forces ahead of a step, see discontinuities.py; 0: no samples
     TIME_SPACING,  # longest time (s) between samples of the forces at a fixed state, see discontinuities.py
-    # 1: forces may be sampled along the predicted motion; 0: not any more, as a callback raised an exception
-    SAMPLE_MOTION,
+    SAMPLE_MOTION,  # 1: forces may be sampled along predicted motion; 0: no more, since a callback raised an exception
     BY_TIME,  # 1: a force or a constraint rate (C_t, b) may change suddenly with time; 0: none does
     BY_STATE,  # 1: a force may change suddenly with q or v: steps longer than SPACING sample the motion; 0: none does
     FIRST_GIVEN,  # 1: the user has chosen the first step size; 0: it is a guess, and may grow before a step is accepted
     MAX_EVALUATION_GAP,  # longest time in a step between two evaluations of the equations, relative to the step size
     TAKES_MANY,  # 1: the method has a function `attempt_many`, which takes steps without checks between them; 0: none
-    CHECKS_WITHIN,  # 1: after a run has come near a singular position, check pivots of C_q within each step; 0: never
+    CHECKS_WITHIN,  # 1: once a run has come near a singular position, check pivots of C_q within each step; 0: never
     N_CONTROL,
 ) = range(N_RULE, N_RULE + 25)
 
-# columns of `out_steps`, which has one row for each accepted step. H: step size (s). The other columns are counts since
-# the start of the run. ERRORS: steps rejected for their error. FAILURES: failed steps. PARTITIONS: chosen partitions.
-# JACOBIANS: Jacobians evaluated by an implicit method (0 in the row of an explicit step)
+# columns of `out_steps`, which has one row for each accepted step: the step size H (s), and counts since the start of
+# the run, of steps rejected for their errors, of steps that failed, of chosen partitions, and of Jacobians evaluated by
+# an implicit method (0 in the row of an explicit step)
 H, ERRORS, FAILURES, PARTITIONS, JACOBIANS, N_STEP_COLUMNS = range(6)
 
 # indices in `clock`, after the history of step-size control
@@ -80,7 +79,7 @@ H, ERRORS, FAILURES, PARTITIONS, JACOBIANS, N_STEP_COLUMNS = range(6)
     LIMIT_AGE,  # number of accepted steps since the last failed step
     NEXT_OUTPUT,  # index of the next output time in the array `outputs`
     T_START,  # start time of the run (s); steps of fixed size h end on the grid T_START + k h
-    N_FIXED,  # index k of the last grid time T_START + k h that steps of fixed size have reached
+    N_FIXED,  # index k of the last grid time T_START + k h that steps of fixed size h have reached
     FAILURE_CODE,  # code of the last failed step, for messages about short steps; DONE: no step failed recently
     H_FAILED,  # size (s) of the step that failed last, or that caused the code ROWS_VIOLATED or SWITCH_METHOD
     H_LONG,  # longest recent step (s): after a step, the larger of its size and H_LONG_DECAY times the old H_LONG
@@ -89,31 +88,32 @@ H, ERRORS, FAILURES, PARTITIONS, JACOBIANS, N_STEP_COLUMNS = range(6)
     JUMP_TO,  # end (s) of the short time span with the next known jump of a constraint rate (C_t, b)
     APPLIES_JUMP,  # 1: the next step ends at JUMP_TO, in the state that `new_state` already contains; 0: ordinary step
     JUMP_END,  # end (s) of the last step rejected with a very large error: a force may jump before this time
-    PIVOT_HERE,  # fixed-order form: smallest pivot, w.pivot, at the end of the last step
-    # samples of forces and constraint rates ahead of a step: at the state where it begins, or along predicted motion
+    # fixed-order form: smallest pivot at the end of the last accepted step, or of a later one that `ends_near_singular`
+    PIVOT_HERE,
+    # samples of forces, C_t and b ahead of a step: at a fixed state, where the step begins, or along predicted motion
     SAMPLED_TO,  # time (s) of the last sample at a fixed state
     SAMPLED_EVERY,  # time (s) from one sample at a fixed state to the next, in the last set of samples
-    WIDEST_SAMPLING,  # longest time (s) so far from one sample to the next
+    WIDEST_SAMPLING,  # longest time (s) so far from one sample of the forces to the next
     DISCONTINUITY,  # time (s) of the next sudden change in samples at a fixed state; infinite: none is known
     DISCONTINUITY_OF_MOTION,  # time (s) of the next sudden change in samples along the motion; infinite: none is known
-    COMPARED,  # beginning (s) of the last short step whose force samples were compared with samples before and after it
-    LAST_CHANGE,  # time (s) of the last sudden change of a force or a constraint rate; -infinite: none
-    SHORTEST_CHANGE,  # shortest time (s) from a sudden change to the next one so far; infinite: fewer than two changes
+    COMPARED,  # time (s) at which the last short step began that was searched for pulses of a force
+    LAST_CHANGE,  # time (s) of the last sudden change of a force, C_t or b; -infinite: none
+    SHORTEST_CHANGE,  # shortest duration (s) of a pulse, or time between sudden changes, of a force; infinite: unknown
     MOTION_SAMPLED_TO,  # time (s) of the last sample along the motion
     SAMPLES_MOTION,  # 1 while callbacks are called at predicted states: exceptions there do not end the run; 0: else
-    # smallest value, at output times and at ends of steps of fixed size, of (smallest / largest pivot of C_q)
+    # smallest ratio so far of the smallest to the largest pivot of [C_q; A], at output times and ends of fixed steps
     PIVOT_AT_OUTPUT,
     # smallest pivot of C_q within steps taken while MAY_CROSS was SUSPENDED, divided by LARGEST_PIVOT; 0: no such step
     PIVOT_PASSED,
     N_CLOCK,
 ) = range(N_PAST, N_PAST + 29)
 
-# constants of the power iterations in stiffness.py and run/messages.py. They estimate the largest rate of the motion,
-# rho (1/s), from the largest eigenvalues of dF/dq and dF/dv, where F(q, v) are the accelerations
-DISPLACEMENT = 1e-6  # displacement of q (or v) in finite differences, relative to the largest coordinate (or velocity)
+# constants of the power iterations in stiffness.py and run/messages.py, which estimate the largest rate of the motion
+# (1/s) from eigenvalues of dF/dq and dF/dv, where F(q, v) are the accelerations
+DISPLACEMENT = 1e-6  # displacement of q (or of v) in finite differences, relative to max(1, its largest |entry|)
 INNER_TOL = 1e-8  # Newton's method, which projects displaced positions, stops after a correction of at most this
 
 
 def initial_direction(n_q: int) -> NDArray[np.float64]:
-    """Return a direction (n_q) with which a power iteration begins; its components differ, as in a vibration mode."""
+    """Return a vector (n_q) with which a power iteration begins; its components differ, as in a vibration mode."""
     return np.asarray(0.3 + 0.1 * (np.arange(n_q) % 7))

@@ -8,42 +8,40 @@ from twoloop.kernels.evaluation.partition import MAX_ROWS_ELIMINATED, min_pivot_
 from twoloop.kernels.evaluation.sparse_inner_loop import PROJECT_STAGES
 
 SHORT_STEP = 0.5  # check for a singular position if a step is shorter than this fraction of the longest recent step
-# compute the pivots of C_q anew if a step is shorter than this fraction of the longest recent step
-COLLAPSED_STEP = 0.2
+COLLAPSED_STEP = 0.2  # compute the pivots of C_q anew if a step is shorter than this fraction of the longest recent one
 # a singular position counts as near if the smallest pivot of C_q is below this fraction of its maximum in the run
 SINGULAR_PIVOT = 0.2
 # value used instead of SINGULAR_PIVOT in the fixed-order form, whose pivots are sines of angles between rows of C_q
 FIXED_ORDER_SINGULAR = 0.01
-# fixed-order form: if the smallest pivot is below this fraction of its maximum in the run, a rejected step is repeated
-# with its stages projected onto the constraints
+# fixed-order form: if the smallest pivot is below this fraction of its maximum in the run, a rejected or failed step is
+# repeated with its stages projected onto the constraints
 REPEAT_PIVOT = 0.05
-SHRINKAGE = 0.8  # size of a step that is repeated with projected stages, relative to the size of the rejected step
+SHRINKAGE = 0.8  # size of a step that is repeated again with projected stages, relative to the size rejected last
 MIN_STEP_NEAR_SINGULAR = 0.001  # shortest useful step near a singular position, relative to the longest recent step
 # if no crossing can be attempted, the run ends when the smallest pivot is below this fraction of its maximum in the run
 UNDETERMINED_PIVOT = 1e-6
-CHECK_INTERVAL = 16  # number of steps between two checks of the partition with generated code, which does not use it
+CHECK_INTERVAL = 16  # number of steps between checks of the partition in runs with generated code, which needs none
 # in the augmented form, with n degrees of freedom, the partition is checked every 1 + n // FREEDOMS_PER_CHECK steps,
 # because each check computes the null space of [C_q; A], a dense matrix that steps in this form do not need
 FREEDOMS_PER_CHECK = 32
 N_CHECKED_PARTS = 8  # number of equal parts of a step between which `comes_near_singular` computes the smallest pivot
-# pivots within a step are computed if the smallest pivot at one of its ends is below this fraction of LARGEST_PIVOT
+# pivots within a step are computed if the smallest pivot at one of its ends is below this part of clock[LARGEST_PIVOT]
 MAX_UNCHECKED_PIVOT = 0.5
-# `comes_near_singular` samples the smallest pivot in a step. This may be zero between two samples if one of them is
-# below this fraction of the largest change from sample to sample
+# `comes_near_singular` samples the smallest pivot in a step. Between two samples it may be zero if one of them is below
+# this fraction of the largest difference of successive samples
 PASSED_PIVOT_RATIO = 0.6
 # MIN_NEAR_RATIO, MAX_NEAR_RATIO: limits of the result of `near_pivot_ratio`. MAX_ROUNDING_ERROR: allowed rounding error
 # near a singular position, in tolerances. EPS: unit roundoff
 MIN_NEAR_RATIO, MAX_NEAR_RATIO, MAX_ROUNDING_ERROR, EPS = 0.02, 0.1, 0.2, 2.0**-53
-# `ends_near_singular` requires that the smallest pivot at the end is below this fraction of that at the beginning
-MIN_END_RATIO = 0.25
+MIN_END_RATIO = 0.25  # `ends_near_singular` is False if a step leaves more than this fraction of the smallest pivot
 
 
 @merged
 def is_near_singular(f, w, control, clock, t, q):
-    """Return True if control[MAY_CROSS] is 1 and a singular position is near the accepted position q at time t.
+    """Return True if a singular position is near the accepted position q at time t, and control[MAY_CROSS] is 1.
 
-    The smallest pivot at the last choice of a partition, w.pivot, decides. If it is small, or may be old because
-    generated code does not use the partition, choose a new partition at (t, q) first.
+    It is near if the smallest pivot of C_q is small, or if no partition can be chosen. If w.pivot, from the last choice
+    of a partition, is small, or may be old (with generated code, which needs no partition), choose a new one first.
     """
     if control[at.MAY_CROSS] != 1.0:
         return False
@@ -57,7 +55,8 @@ def is_near_singular(f, w, control, clock, t, q):
 def ends_near_singular(f, w, control, clock):
     """Return True if a step of the fixed-order form ends so near a singular position that no step should begin there.
 
-    The step should then be repeated with another size: a singular position does no harm far from both ends of a step.
+    The caller then repeats it with another size: a singular position within a step does no harm. Return False if the
+    smallest pivot is not much smaller than where the step begins, or for steps of fixed size.
     """
     if f.form != FIXED_ORDER or control[at.FIXED_STEP] > 0.0:
         return False
@@ -73,11 +72,11 @@ def is_too_short_near_singular(f, clock, size):
 
 @merged
 def prepare_projected_repetition(f, w, control, clock, size):
-    """Return True if a rejected step of the fixed-order form must be repeated with its stages projected.
+    """Return True if a rejected or failed step of the fixed-order form is repeated near a singular position.
 
-    Then also set w.nearly_singular, which causes the projection, and clock[H_NEXT]. Near a singular position, stages
-    that violate the constraints have inaccurate accelerations. A long step that ends well beyond the position may
-    succeed where shorter steps fail, so the first repetition is at least as long as clock[H_LONG], a recent long step.
+    Stages that violate the constraints have inaccurate accelerations there: set w.nearly_singular so that they are
+    projected. Store the size of the repetition in clock[H_NEXT]. The first one is at least as long as clock[H_LONG], a
+    recent long step, because it may succeed if it ends well beyond the position; each further one is shorter.
     """
     is_near = clock[at.PIVOT_HERE] < REPEAT_PIVOT * clock[at.LARGEST_PIVOT]
     if f.form != FIXED_ORDER or control[at.FIXED_STEP] > 0.0 or w.nearly_singular == 1.0 or not is_near:
@@ -92,16 +91,16 @@ def prepare_projected_repetition(f, w, control, clock, size):
 
 @merged
 def near_pivot_ratio(tolerances):
-    """Return the ratio of smallest pivot to LARGEST_PIVOT below which rounding may exceed MAX_ROUNDING_ERROR."""
+    """Return the part of clock[LARGEST_PIVOT] below which a pivot makes rounding errors exceed MAX_ROUNDING_ERROR."""
     return min(max(MIN_NEAR_RATIO, (EPS / (MAX_ROUNDING_ERROR * tolerances[LEAST])) ** (1.0 / 3.0)), MAX_NEAR_RATIO)
 
 
 @compiled
 def _smallest_pivot_within_step(f, w, t, size, before, end, state, new_state):
-    """Sample the smallest pivot of C_q within a step of size `size` (s) from t; return two numbers.
+    """Sample the smallest pivot of C_q within a step; return the least sample, and the largest change between samples.
 
-    These are the smallest sample, and the largest change from one sample to the next. `before` and `end` are the
-    samples at the ends of the step. The others are at positions on the cubic through `state` and `new_state`.
+    The step of size `size` (s) leads from `state`, at t, to `new_state`. `before` and `end` are the samples at these
+    states. The other samples are at positions on the cubic through them.
     """
     n, least, change = w.Q.size, min(before, end), 0.0
     for k in range(1, N_CHECKED_PARTS):
@@ -120,8 +119,9 @@ def _smallest_pivot_within_step(f, w, t, size, before, end, state, new_state):
 def comes_near_singular(f, w, control, clock, tolerances, t, size, state, new_state):
     """Return True if a step with a small error estimate comes so near a singular position that it must be discarded.
 
-    Rounding errors of its stages may exceed the tolerances. If control[MAY_CROSS] is SUSPENDED, return False and record
-    the smallest pivot in clock[PIVOT_PASSED]. Far from singular positions, set control[MAY_CROSS] to 1.
+    Rounding errors of its stages may then exceed the tolerances. Only runs that have come near a singular position
+    are checked. If control[MAY_CROSS] is SUSPENDED, return False, and record the smallest pivot in clock[PIVOT_PASSED].
+    If the pivots at both ends of the step are large, set control[MAY_CROSS] to 1.
     """
     may_cross = control[at.MAY_CROSS]
     if may_cross == 0.0 or control[at.CHECKS_WITHIN] == 0.0 or w.nearly_singular != 1.0 or control[at.FIXED_STEP] > 0.0:
@@ -159,10 +159,10 @@ def record_pivot_at_output(f, w, clock, state):
 
 @merged
 def check_partition(f, w, control, clock, size, at_output, state):
-    """Choose a new partition if the present one is poor, and check the pivots; return CONTINUE or an end code.
+    """After a step, choose a new partition if the present one is poor, and check the pivots; return a code.
 
-    The end code is RANK_LOST if no partition can be chosen, or NEAR_SINGULAR. `size` is the size (s) of the last step.
-    `at_output` is True if this step ended at an output time: then it may be short for this reason alone.
+    Codes: CONTINUE, RANK_LOST (no partition can be chosen) or NEAR_SINGULAR. `size`: size (s) of the step. `at_output`:
+    True if the step ended at an output time, and may be short for this reason alone.
     """
     short = size < SHORT_STEP * clock[at.H_LONG] and control[at.FIXED_STEP] == 0.0 and not at_output
     if f.form == FIXED_ORDER:
@@ -183,7 +183,7 @@ def check_partition(f, w, control, clock, size, at_output, state):
         find_tangents(f, w, clock[at.T], state[:n])
     if is_checked and partition_is_poor(w) and renew_partition(f, w, clock[at.T], state[:n]) != DONE:
         return at.RANK_LOST
-    # steps of generated code do not update the pivots: choose a new partition, to see if a singular position is near
+    # near_now = 2: steps of generated code, which do not update w.pivot, request its value at this state
     if f.is_generated == 1 and w.near_now == 2.0 and renew_partition(f, w, clock[at.T], state[:n]) != DONE:
         return at.RANK_LOST
     clock[at.LARGEST_PIVOT] = max(clock[at.LARGEST_PIVOT], w.pivot)
@@ -191,7 +191,7 @@ def check_partition(f, w, control, clock, size, at_output, state):
     if w.pivot < SINGULAR_PIVOT * clock[at.LARGEST_PIVOT]:
         w.nearly_singular = w.near_now = 1.0
     if size < COLLAPSED_STEP * clock[at.H_LONG] and w.nearly_singular == 0.0 and control[at.MAY_CROSS] == 1.0:
-        # pivots are computed when a partition is chosen: old ones do not show the approach to a singular position
+        # w.pivot was computed when the partition was chosen: an old value may hide that a singular position is near
         if renew_partition(f, w, clock[at.T], state[:n]) != DONE:
             return at.RANK_LOST
         w.sensitivity = 1.0  # its value far from singular positions, so that `partition_is_poor` soon is True again

@@ -10,8 +10,8 @@ Two measures show errors that the error estimate of the integration formula miss
   has ended in another assembly, the difference is larger, even if the independent coordinates are smooth. If all
   coordinates are prescribed, this is the only error estimate. Where two assemblies come close to one another, a large
   step may end in the wrong assembly with a small difference. Then the sign of det C_qd changes (C_qd: the dependent
-  columns of C_q). A motion changes this sign only at a singular position, where short steps have nearly exact
-  predictions. So if the sign changes in a step, its prediction must be nearly exact.
+  columns of C_q). In a true motion, this happens only at a singular position, and predictions of short steps there are
+  nearly exact. So if the sign changes in a step, its prediction must be nearly exact.
 - `defect_ratio` measures the defect of a Taylor step: the difference, at the same state, between accelerations by the
   series and by the equations. The series knows the forces at the beginning of the step only, not a later sudden
   change. So the equations are evaluated at the end of the step and, if it is longer than DEFECT_GAP, also within it.
@@ -37,7 +37,7 @@ from twoloop.kernels.evaluation.inner_loop import evaluate, restore_constraints
 from twoloop.kernels.evaluation.tasks import PROJECT
 from twoloop.kernels.linalg.markowitz_lu import determinant_sign
 
-KEEP_BELOW_RATIO = 1.2  # methods that use the trend of errors keep the step size if it could grow by at most this
+KEEP_BELOW_RATIO = 1.2  # methods that use the trend of errors keep the step size if it could grow by no more than this
 
 
 @compiled
@@ -59,14 +59,14 @@ def step_size_ratio(rule, past, h, error):
 
 @merged
 def record_accepted_step(rule, past, h, error):
-    """Store size h (s) and `error` (in tolerances, at least rule[LEAST_ERROR]) of an accepted step in `past`."""
+    """Store the size h (s) and the error (in tolerances, at least rule[LEAST_ERROR]) of an accepted step in `past`."""
     past[H_BEFORE], past[ERROR_BEFORE] = h, max(error, rule[LEAST_ERROR])
 
 
 @compiled
 def project_and_evaluate(f, w, t, Q, V, A):
     """Project the state (Q, V) onto the constraints; store its accelerations in A; return DONE or a failure code."""
-    # in generated code, the task PROJECT is the cheapest; in the fixed-order form, the task EVALUATE does not project
+    # PROJECT is the cheapest task in generated code; in the fixed-order form, EVALUATE would not project the state
     if (f.is_generated == 1 and w.Rate.size == w.C.size) or f.form == FIXED_ORDER:
         return f.inner(f, w, PROJECT, t, Q, V, INNER_TOL, A, w.lam)
     return evaluate(f, w, t, Q, V, INNER_TOL, A)
@@ -82,11 +82,11 @@ EQUAL_SPACINGS = 4.0  # largest difference of times that count as equal, in spac
 
 @merged
 def size_on_grid(clock, t, h, target, goal):
-    """Return three values for a step from t in a run with steps of fixed size h, which end at grid times.
+    """Choose the size of a step from t in a run with steps of fixed size h, which end at the grid times T_START + k h.
 
-    The values are the size (s) of the step, the number of grid times that it reaches (0 or 1), and whether it reaches
-    `goal`. Grid times are T_START + k h. `target`: next output time. If a grid time differs from `target` by at most
-    h / 10^6, both count as equal. `goal`: `target`, or the time of a jump of a constraint rate before `target`.
+    Return the size (s), the number of grid times that the step reaches (0 or 1), and True if it reaches `goal`.
+    `target`: next output time; a grid time counts as equal if it differs by at most h / 10^6. `goal`: `target`, or the
+    time of a jump of a constraint rate (C_t, b) before `target`.
     """
     rounding = EQUAL_SPACINGS * np.spacing(max(abs(t), abs(target)))
     margin = max(1e-6 * h, rounding)
@@ -105,7 +105,7 @@ def size_on_grid(clock, t, h, target, goal):
 
 @merged
 def size_off_grid(control, t, h, left, crosses_jump):
-    """Return the size (s) of a step, about h at most, and True if it ends at t + left (always if `crosses_jump`)."""
+    """Return the size (s) of a step, about h at most, and True if it ends at t + left, as it must if `crosses_jump`."""
     reaches_goal = crosses_jump or h >= left * (1.0 - 1e-10)
     size = h
     if h > 0.5 * left and not reaches_goal:
@@ -116,12 +116,12 @@ def size_off_grid(control, t, h, left, crosses_jump):
     return size, reaches_goal
 
 
-H_LONG_DECAY = 0.98  # each accepted step multiplies clock[H_LONG], the longest recent step size, by this factor
+H_LONG_DECAY = 0.98  # factor by which each accepted step reduces clock[H_LONG], the longest recent step size
 
 
 @merged
 def count_step(w, tolerances, control, clock, size, out_step):
-    """Count an accepted step of size `size` (s): update clock[H_LONG] and statistics in w; fill `out_step`, its row."""
+    """Count an accepted step of size `size` (s): update clock[H_LONG] and statistics in w; fill its row `out_step`."""
     w.n_accepted += 1
     if w.defect >= 0.0:
         w.largest_defect = max(w.largest_defect, w.defect)
@@ -142,28 +142,27 @@ def count_step(w, tolerances, control, clock, size, out_step):
     out_step[at.JACOBIANS] = 0.0 if w.explicit_step == 1.0 else w.n_jacobians
 
 
-# allowed error of a predicted position, relative to the largest displacement of any coordinate in the step
+# allowed error of a predicted dependent position, relative to the largest displacement of a coordinate in the step
 FRACTION_OF_MOTION = 0.1
 FRACTION_AT_SIGN_CHANGE = 1e-6  # replaces FRACTION_OF_MOTION if det C_qd (dependent columns of C_q) changes sign
 LEAST = 1e-300  # lower bound of the allowed error of a predicted position, which avoids a division by zero
-# this fraction of the tolerance is added to FRACTION_OF_MOTION times the displacement, for steps that hardly move
-FIXED_FRACTION = 0.01
+FIXED_FRACTION = 0.01  # this fraction of the tolerance is also allowed, for steps in which coordinates hardly move
 
 
 @merged
 def store_prediction(w, q1):
-    """Copy the dependent positions in q1 (n_q), which the integration formula has predicted, to w.predicted."""
+    """Copy the dependent entries of q1 (n_q), which the integration formula has predicted, to w.predicted."""
     for k in range(w.dependent.size):
         w.predicted[k] = q1[w.dependent[k]]
 
 
 @merged
 def prediction_error(w, tolerances, h, q, v, q1):
-    """Return the largest error of the dependent positions that the formula predicts, divided by the allowed error.
+    """Return the largest |w.predicted - q1| (dependent positions) / (allowed error), for a step from (q, v) to q1.
 
-    The step of size h leads from (q, v) to q1. The error is the difference of w.predicted and q1, whose positions
-    satisfy the constraints. The allowed error is the tolerance or, if smaller, about FRACTION_OF_MOTION times the
-    displacement. `w` must contain factors of the dependent columns of C_q at q1. For steps of fixed size, return 0.
+    q1 satisfies the constraints; the integration formula predicted w.predicted. The allowed error is the tolerance or,
+    if smaller, about FRACTION_OF_MOTION (if det C_qd changes sign: FRACTION_AT_SIGN_CHANGE) times the displacement.
+    Store the sign in w.orientation_new, from factors of C_qd at q1, which `w` must contain. For fixed steps, return 0.
     """
     if tolerances[ESTIMATE] == 0.0:
         return 0.0
@@ -184,7 +183,7 @@ def prediction_error(w, tolerances, h, q, v, q1):
 
 @merged
 def project_prediction(f, w, tolerances, t, h, q, v, q1, v1, inner_tol):
-    """Move the predicted (q1, v1) onto the constraints; return DONE or a failure code, and the `prediction_error`."""
+    """Move the predicted (q1, v1) onto the constraints; return DONE or a failure code, and the prediction's error."""
     store_prediction(w, q1)
     code = restore_constraints(f, w, t, q1, v1, inner_tol)
     return code, prediction_error(w, tolerances, h, q, v, q1) if code == DONE else 0.0
@@ -197,8 +196,8 @@ ROUNDING = 1e-13  # a defect up to this fraction of the largest acceleration cou
 def defect_ratio(tolerances, h, order, predicted, a, q, v):
     """Return the largest defect |predicted - a| of accelerations at the end (q, v) of a Taylor step of size h.
 
-    `predicted`: accelerations by the series; `a`: by the equations. Defects are relative to the allowed defect, which
-    causes errors of one tolerance in q or v. The defect of a series of order `order` grows as the highest power of
+    `predicted`: accelerations by the series; `a`: by the equations. A defect is divided by the allowed defect, which
+    causes an error of one tolerance in q or v. The defect of a series of order `order` grows as the highest power of
     time: its integral over the step is h / order times its value at the end. Return inf if a value is not finite.
     """
     rtol, duration, largest, ratio = tolerances[RTOL], h / order, 0.0, 0.0
