@@ -1,8 +1,7 @@
 """Generate code for many runs of one mechanism at once: every number is a vector, with one run in each of its lanes.
 
 `series`, `elimination` and `compile_equations` write the operations. Coefficients are read as vectors, so that each run
-may have its own parameters. The step-size control of Taylor series is generated, too. For the memory `work` and its
-fields, such as T, H, NEW, see kernels/lanes/layout.py. Code is cached on disk for all equations of equal structure.
+may have its own parameters. The step-size control of Taylor series is generated, too. Code is cached on disk.
 """
 
 import hashlib
@@ -78,8 +77,9 @@ class LaneMemory(NamedTuple):
 class LaneSteps:
     """Generator of the code of steps in SIMD lanes, for n coordinates and n_rows multipliers.
 
-    Arguments of methods: `emit` appends instructions to a function. `order` is the order of Taylor series. `control`
-    points to settings, `work` to vectors: kernels/lanes/layout.py describes their fields, with names in capitals.
+    Arguments of methods: `emit` appends instructions to a function; `order`: order of the Taylor series; `control` and
+    `work`: pointers to settings and to the memory of the lanes. Names in capitals are fields of this memory, such as
+    STATE, the state before the step, and NEW, the state after it or within it: see kernels/lanes/layout.py.
     """
 
     n_numbers: int  # number of coefficients that depend on parameters
@@ -88,7 +88,7 @@ class LaneSteps:
         self.n, self.n_rows = n, n_rows
 
     def update_unit(self, emit: LaneEmitter, control: Value, work: Value) -> Value:
-        """Write code that stores a new UNIT (s), the unit of time of the series, after accepted steps; return UNIT."""
+        """Write code that stores UNIT (s), the unit of time of the series: about the last step size; return it."""
         select, unit = emit.builder.select, emit.load(work, lanes.UNIT)
         is_fresh, is_accepted = (is_set(emit, work, field) for field in (lanes.IS_NEW, lanes.ACCEPTED))
         duration = broadcast_entry(emit, control, lanes.T1) - broadcast_entry(emit, control, lanes.T0)
@@ -101,7 +101,7 @@ class LaneSteps:
         return unit
 
     def choose_sizes(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Write code that stores H, the step size (s) by the last terms of the series, and X = H / UNIT."""
+        """Write code that chooses the step size H (s) by the last two terms of the series, and stores X = H / UNIT."""
         builder, n, memory = emit.builder, self.n, self.memory(emit, order, control, work)
         unit, (rtol, atol) = emit.load(work, lanes.UNIT), self.tolerances(emit, control)
         one, norms = emit.constant(1.0), []
@@ -137,13 +137,13 @@ class LaneSteps:
             store_mask(emit, work, field, is_continued)
 
     def evaluate_series(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Write code that evaluates the series at X units of time, and stores NEW, `series_a`, and q as `predicted`."""
+        """Write code that evaluates the series at the end of the step, and stores NEW, `series_a` and `predicted`."""
         memory = self.memory(emit, order, control, work)
         for j, q in enumerate(self.evaluate_positions(emit, memory, emit.load(work, lanes.X))):
             emit.store(q, memory.predicted, j)
 
     def evaluate_positions(self, emit: LaneEmitter, memory: LaneMemory, x: Value) -> list[Value]:
-        """Write code that evaluates the series at x units of time, and stores NEW and `series_a`; return positions."""
+        """Write code that evaluates the series at x units of time, and stores NEW (q, v) and `series_a`; return q."""
         positions: list[Value] = []
         n, order = self.n, memory.order
         unit, zero = emit.load(memory.work, lanes.UNIT), emit.constant(0.0)
@@ -169,13 +169,13 @@ class LaneSteps:
         return positions
 
     def evaluate_defect(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Write code that stores DEFECT, the result of `compute_defect` for stored accelerations at the step's end."""
+        """Write code that stores DEFECT, the defect of the series at the end of the step, see `compute_defect`."""
         memory = self.memory(emit, order, control, work)
         a = [emit.load(memory.a, j) for j in range(self.n)]
         emit.store(self.compute_defect(emit, control, memory, a), work, lanes.DEFECT)
 
     def compute_defect(self, emit: LaneEmitter, control: Value, memory: LaneMemory, a: list[Value]) -> Value:
-        """Write code for the defect of the series at NEW, relative to its limit; return it. See control/step_size.py.
+        """Write code for the defect of the Taylor series at the state NEW, relative to the allowed defect; return it.
 
         The defect is the difference between accelerations by the series and `a`, accelerations by the equations.
         """
@@ -195,7 +195,7 @@ class LaneSteps:
         return duration * max_defect
 
     def compute_prediction_error(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Write code that stores PREDICTION_ERROR: |predicted - projected q| / limit, see control/step_size.py."""
+        """Write code that stores PREDICTION_ERROR, the change of q by the projection, relative to its limit."""
         n, memory, (rtol, atol) = self.n, self.memory(emit, order, control, work), self.tolerances(emit, control)
         h = emit.load(work, lanes.H)
 
@@ -222,7 +222,7 @@ class LaneSteps:
         emit.store(error, work, lanes.PREDICTION_ERROR)
 
     def crossing_mask(self, emit: LaneEmitter, memory: LaneMemory) -> Value | None:
-        """Write code for a mask of lanes whose step may have passed a singular position; return it; None: no check."""
+        """Write code for a mask of lanes whose step may have passed a singular position; return it. None: no check."""
         return None
 
     def accept_or_reject(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
@@ -312,7 +312,7 @@ SparseRows = list[dict[int, Value]]  # the nonzero entries of each row, by colum
 
 
 def orientation_change_mask(emit: LaneEmitter, before: SparseRows, after: SparseRows) -> Value:
-    """Write code for a mask, and return it: lanes where det G1 G0^T <= 0 may have passed a singular position.
+    """Write code for a mask of lanes whose step may have passed a singular position, as det G1 G0^T <= 0; return it.
 
     G0 (`before`) and G1 (`after`) are the rows of the constraints at both ends of the step. By the Cauchy-Binet
     formula, the determinant is the inner product of the vectors of maximal minors of G0 and G1. It is positive if these
@@ -350,7 +350,7 @@ def orientation_change_mask(emit: LaneEmitter, before: SparseRows, after: Sparse
 
 Array = NDArray[np.float64]
 
-WEIGHT_ROUNDING = 1e-13  # weights up to this size count as zero: they are rounding errors of products such as A @ A
+WEIGHT_ROUNDING = 1e-13  # weights of stages up to this size count as zero: they are rounding errors
 
 # explicit Runge-Kutta method: arrays A, b, c of its Butcher tableau, then weights of stages in two error estimates
 Tableau = tuple[Array, Array, Array, Array, Array]
@@ -359,8 +359,8 @@ Tableau = tuple[Array, Array, Array, Array, Array]
 class LaneStages:
     """Generator of the stages of an explicit Runge-Kutta method, and of its error estimates, for n coordinates.
 
-    Velocities at stages are sums of accelerations weighted by A, positions are sums weighted by A @ A, so that each
-    acceleration is loaded once for both. Weights are literals in the code; terms with a weight of zero are left out.
+    With the matrix A of the Butcher tableau, velocities at stages are sums of accelerations weighted by A, positions
+    are sums weighted by A @ A. Weights are literals in the code; terms with a weight of zero are left out.
     """
 
     def __init__(self, tableau: Tableau, n: int):
@@ -372,7 +372,7 @@ class LaneStages:
         return [np.asarray(each).tobytes() for each in self.tableau]
 
     def write(self, emit: LaneEmitter, arguments: tuple[Value, Value, Value], memory: LaneMemory) -> None:
-        """Write code for NEW, the state X (s) after the step began, and ERROR; it is valid only if X = H."""
+        """Write code that stores NEW, the state at X (s) after the step began, and ERROR, which is valid if X = H."""
         A, b, c, fine_weights, coarse_weights = self.tableau
         _, control, work = arguments
         x, t = emit.load(work, lanes.X), emit.load(work, lanes.T)
@@ -406,7 +406,7 @@ class LaneStages:
         error = e / emit.function("sqrt", 1.0 + ratio * ratio)
         select, compare = emit.builder.select, emit.builder.compare
         error = select(compare("fcmp ogt", e, zero), error, zero)
-        # the maxima e and d ignore NaN; `total` does not: it is NaN if a value is not finite
+        # the maxima e and d ignore NaN; `total`, a sum of zeros, is NaN if a value is not finite
         error = select(compare("fcmp oeq", total, zero), error, emit.constant(math.inf))
         emit.store(error, work, lanes.ERROR)
 
@@ -442,7 +442,7 @@ class _Coordinate:
         return 1.0 / (atol + rtol * magnitude)
 
     def store_state(self, weights: Array, position_weights: Array, x: Value) -> tuple[Value, Value]:
-        """Write code that stores q and v at a stage in NEW; return both. Weights: of accelerations in v, and in q."""
+        """Write code that stores q and v at a stage in NEW; return both. `weights`: of accelerations in v."""
         emit, (q, v) = self.emit, self.old_state
         drift = float(weights.sum()) * v
         q = q + x * (drift + x * self.sum(position_weights))
@@ -525,7 +525,7 @@ class LaneCode(LaneSteps):
     # methods that write the generated functions
 
     def compute_series(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Write code that computes the Taylor coefficients of q about STATE in each lane, with UNIT as unit of time."""
+        """Write code for the Taylor coefficients of q(t) from STATE on in each lane, with UNIT as unit of time."""
         builder, n, memory = emit.builder, self.n, self.memory(emit, order, control, work)
         unit, out, scratch = self.update_unit(emit, control, work), memory.series, memory.scratch
         inputs = [emit.load(work, lanes.T), *(emit.load(memory.state, i) for i in range(2 * n))]
@@ -547,10 +547,10 @@ class LaneCode(LaneSteps):
         store_mask(emit, work, lanes.ACTIVE, is_valid)
 
     def check_defect_within(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Write code that stores WORST_DEFECT, the largest defect at times within the step, at most GAP (s) apart.
+        """Write code that stores WORST_DEFECT, the largest defect at several times within the step.
 
-        T_NEW becomes each of these times, and finally the time at the end of the step. The times are equidistant, and
-        lie differently in each step: SHIFT, a multiple of the golden section modulo 1, moves them as far as GAP allows.
+        The times are equidistant, at most GAP (s) apart. They lie differently in each step: SHIFT, a multiple of the
+        golden section modulo 1, moves them as far as GAP allows. Finally, T_NEW is the time at the end of the step.
         """
         builder, memory = emit.builder, self.memory(emit, order, control, work)
         h, gap = emit.load(work, lanes.H), broadcast_entry(emit, control, lanes.GAP)
@@ -578,7 +578,7 @@ class LaneCode(LaneSteps):
         emit.store(builder.select(is_last, t1, t + h), work, lanes.T_NEW)
 
     def correct_positions(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Write code that corrects q in NEW once where ACTIVE is 1; then ACTIVE = UNCONVERGED = 1 (valid) or 0."""
+        """Write code for a Newton step of q in NEW where ACTIVE is 1; ACTIVE = UNCONVERGED = 1 where valid, else 0."""
         is_active, _ = self._project(
             emit, self.equations.position_projection, lanes.ACTIVE, self.memory(emit, order, control, work)
         )
@@ -641,14 +641,14 @@ class LaneCode(LaneSteps):
         return is_valid, a
 
     def crossing_mask(self, emit: LaneEmitter, memory: LaneMemory) -> Value | None:
-        """Return `orientation_change_mask` for the step; None for Taylor steps: defects show singular positions."""
+        """Return the result of `orientation_change_mask`; None for Taylor steps: defects show singular positions."""
         if self.recurrences is not None or len(self.equations.rows) == 0:
             return None
         ends_of_step = (lanes.T, memory.state), (lanes.T_NEW, memory.new)
         return orientation_change_mask(emit, *(self._row_values(emit, memory, *end) for end in ends_of_step))
 
     def _row_values(self, emit: LaneEmitter, memory: LaneMemory, time: int, base: Value) -> list[dict[int, Value]]:
-        """Write code for G; return {column: entry} for each row; `time`: T or T_NEW; `base`: address of [q, v]."""
+        """Write code for C_q; return {column: entry} for each row. `time`: T or T_NEW; `base`: pointer to [q, v]."""
         inputs = [emit.load(memory.work, time), *(emit.load(base, i) for i in range(2 * self.n))]
         _, (entries,) = lower_program(emit, self._row_program, inputs, self.numbers)
         rows: list[dict[int, Value]] = [{} for _ in self.equations.rows]

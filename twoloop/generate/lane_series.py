@@ -46,7 +46,7 @@ class LaneEmitter(Emitter):
         super().__init__(builder, lanes)
 
     def coefficient(self, number: float) -> Value:
-        """Return `number` in all lanes; load a Coefficient: one value for each lane if it varies, else one for all."""
+        """Return `number` in all lanes; load a Coefficient: a vector if it varies between lanes, else a number."""
         if not isinstance(number, Coefficient) or number.varies:
             return super().coefficient(number)
         pointer = self.builder.advance(self.constants, integer(number.index))
@@ -92,18 +92,18 @@ class LaneEmitter(Emitter):
         return power * self.polynomial(EXP2_COEFFICIENTS, x - whole)
 
     def minimum_or_nan(self, a: Value, b: Value) -> Value:
-        """Return the smaller one of a and b, or a if either is NaN; so the result is NaN if a is NaN."""
+        """Return the smaller one of a and b, or a if either is NaN."""
         return self.builder.select(self.builder.compare("fcmp ult", a, b), a, b)
 
     def maximum_or_nan(self, a: Value, b: Value) -> Value:
-        """Return the larger one of a and b, or a if either is NaN; so the result is NaN if a is NaN."""
+        """Return the larger one of a and b, or a if either is NaN."""
         return self.builder.select(self.builder.compare("fcmp ugt", a, b), a, b)
 
 
 def load_lanes(emit: LaneEmitter, base: Value, index: int = 0) -> Value:
     """Return the vector base[index : index + STAGES]: one number for each stage of a collocation step.
 
-    Its address must be aligned to the size of the vector. This is slow if the elements have just been stored one by
+    Its address must be aligned to the size of the vector. Loading is slow if the numbers have just been stored one by
     one: the processor waits until all are stored.
     """
     start, kind = emit.builder.advance(base, integer(index)), vector_of(DOUBLE, STAGES)
@@ -117,7 +117,7 @@ def store_lanes(emit: LaneEmitter, value: Value, base: Value, index: int = 0) ->
 
 
 def two_sums(emit: LaneEmitter, a: Value, b: Value) -> list[Value]:
-    """Return two numbers, the sum of the elements of a and that of b; the same instructions compute both."""
+    """Return two numbers: the sum of all lanes of a, and the sum of all lanes of b."""
     builder, half = emit.builder, STAGES // 2
     lower_half, upper_half = ([*range(k, k + half), *range(STAGES + k, STAGES + k + half)] for k in (0, half))
     total = builder.shuffle(a, b, lower_half) + builder.shuffle(a, b, upper_half)
@@ -127,7 +127,7 @@ def two_sums(emit: LaneEmitter, a: Value, b: Value) -> list[Value]:
 
 
 def gather_lane(emit: LaneEmitter, vectors: Sequence[Value], lane: int) -> Value:
-    """Return a vector of the elements in lane `lane` of all `vectors`; for a single vector, return this element."""
+    """Return a vector of the numbers that `vectors` have in lane `lane`; for a single vector, return this number."""
     builder, indices = emit.builder, [lane, STAGES + lane]
     if len(vectors) == 1:
         return builder.extract(vectors[0], lane)
@@ -142,7 +142,7 @@ def gather_lane(emit: LaneEmitter, vectors: Sequence[Value], lane: int) -> Value
 def loop_over_coordinates(
     emit: LaneEmitter, coordinates: Sequence[int], carried: Sequence[Value] = ()
 ) -> Iterator[tuple[Value, Value, list[Any], list[Any]]]:
-    """Return a context manager that writes a loop over k, like `Emitter.loop`; it also yields coordinates[k]."""
+    """Return a context manager that writes a loop over k, as `Emitter.loop` does, and also yields coordinates[k]."""
     builder = emit.builder
     table = None if list(coordinates) == list(range(len(coordinates))) else builder.module.add_table(coordinates)
     with emit.loop(integer(0), integer(len(coordinates)), carried) as (k, values, new):
@@ -150,7 +150,7 @@ def loop_over_coordinates(
         yield k, i, values, new
 
 
-ZERO_ROW = -1  # index of a row of zeros; in memory, the rows with coefficients of order 0, 1, ... follow it
+ZERO_ROW = -1  # index of a row of zeros in memory; rows 0, 1, ... contain the coefficients of order 0, 1, ...
 # largest number of sums that one loop adds up: each needs a register, and there are 32 of eight doubles, or 16 of four
 MAX_SUMS_IN_LOOP = 12 if LANES == 8 else 6
 
@@ -159,13 +159,13 @@ class Operation(NamedTuple):
     """Operation on Taylor series; the sine and the cosine of an angle are one operation with two results."""
 
     kind: int  # such as PRODUCT, see kernels/evaluation/operations.py
-    results: tuple[int, ...]  # indices of the quantities that are the results
+    results: tuple[int, ...]  # indices of its results among all quantities
     first: tuple[Terms, float]  # terms and constant of the first argument
     second: tuple[Terms, float]  # terms and constant of the second argument
 
 
 class LaneSeries:
-    """Generator of the code for the recurrences of a SeriesProgram.
+    """Generator of code that computes the Taylor series of the motion, by the operations of a SeriesProgram.
 
     `scratch` is an array of vectors. Its parts: the factored matrix of the linear equations M a + G^T lam = r and
     G a = c for accelerations a and multipliers lam; r; the reciprocal divisors in recurrences of roots, logarithms and
@@ -184,8 +184,7 @@ class LaneSeries:
         self.late = self._make_operations(program.late, first_result + len(program.early.first.column))
         self.rows = self._row_expressions(program.rows, program.row_indices)
         self.balance = self._row_expressions(program.balance, program.balance_indices)
-        # keys: products whose sums other recurrences compute; values: factors in these, see `_shared_sums`. `_factors`,
-        # which `_shared_sums` calls, reads this dict: so it is empty at first
+        # the result of `_shared_sums`; it is empty at first, because `_shared_sums` calls `_factors`, which reads it
         self._carried_sums: dict[int, tuple[int, int]] = {}
         self._carried_sums |= self._shared_sums()
         self.carried_pairs = sorted(set(self._carried_sums.values()))
@@ -206,11 +205,11 @@ class LaneSeries:
 
     @property
     def structure(self) -> list[Any]:
-        """Return the data that determine the code; their hash identifies code that has been compiled before."""
+        """Return the data that determine the code: their digest is the key of cached code."""
         return [self.n, self.n_rows, self.early, self.late, self.rows, self.balance, self.factor_indices]
 
     def _expressions(self, sums: Sums, rows: Sequence[int]) -> list[tuple[Terms, float]]:
-        """Return (terms, constant) of each expression in `sums`; `rows[k]`: number of expression k in `sums.row`."""
+        """Return (terms, constant) of each expression k in `sums`, which has the index rows[k] in `sums.row`."""
         more: dict[int, list[tuple[int, float]]] = {row: [] for row in rows}
         for row, i, c in zip(
             sums.row.tolist(), sums.further_column.tolist(), sums.further_coefficient.tolist(), strict=True
@@ -223,7 +222,7 @@ class LaneSeries:
         ]
 
     def _row_expressions(self, sums: Sums, indices: Any) -> list[tuple[int, tuple[Terms, float]]]:
-        """Return a pair for each expression k in `sums`: its row number, indices[k]; its (terms, constant)."""
+        """Return a pair for each expression k in `sums`: the index of its equation, indices[k]; (terms, constant)."""
         return list(zip(indices.tolist(), self._expressions(sums, indices.tolist()), strict=True))
 
     def _make_operations(self, table: OperationGroups, quantity: int) -> list[Operation]:
@@ -238,19 +237,19 @@ class LaneSeries:
         return operations
 
     def _factor_index(self, *key: Any) -> int:
-        """Return the index, in each row, of a factor of products of series; a new factor gets the next index.
+        """Return the index at which each row stores the coefficient of a factor; a new factor gets the next index.
 
-        `key`: (terms, constant) of the factor; or ("scaled", terms, constant): then a row stores order * coefficient.
+        `key`: (terms, constant) of the factor; or ("scaled", terms, constant): then rows store order * coefficient.
         """
         return self.factor_indices.setdefault(key, len(self.factor_indices))
 
     def _shared_sums(self) -> dict[int, tuple[int, int]]:
-        """Find products (cos x) x' and (sin x) x', whose sums need no loop: recurrences of sin x, cos x have the same.
+        """Find products (cos x) x' and (sin x) x': the recurrences of sin x and cos x yield their coefficients, too.
 
         (cos x) x' is the derivative of sin x. So the sum in the recurrence of sin x for order k + 1, divided by the
         unit of time, is coefficient k of (cos x) x', except for one term. This term contains coefficient k of x', which
         is not known yet. The same holds for (sin x) x' and cos x. Keys of the returned dict: indices of the quantities
-        (cos x) x' or (sin x) x'; values: the two factors in the recurrence of the sine or cosine, see `_factors`.
+        (cos x) x' or (sin x) x'; values: indices of the two factors in the recurrence of the sine or cosine.
         """
         pairs: dict[Any, tuple[int, int]] = {}
         for operation in self.early:
@@ -264,7 +263,7 @@ class LaneSeries:
         return {result: pair for result, pair in pair_of.items() if pair is not None}
 
     def _factors(self, operation: Operation) -> list[tuple[int, int]]:
-        """Return, for each result, indices of two factors X, Y: its recurrence needs sums of X[j] Y[k - j] over j."""
+        """Return for each result the indices of factors X and Y whose sum of X[j] Y[k - j] its recurrence needs."""
         kind, results, first, second = operation
         if results[0] in self._carried_sums:
             return []
@@ -281,7 +280,7 @@ class LaneSeries:
         return [(x, result_indices[1]), (x, result_indices[0])] if kind == SINE else [(x, result_indices[0])]
 
     def write_order_0(self, emit: LaneEmitter, inputs: Sequence[Value], scratch: Value) -> None:
-        """Write code that stores the row of order 0 in `scratch`, where the matrix already is; `inputs`: t, q, v."""
+        """Write code that begins a series: it stores coefficients of order 0 in `scratch`. `inputs`: t, q, v."""
         for index in (*range(self.rhs_offset, self.divisor_offset), *range(self.carried_offset, self.row_0_offset)):
             emit.store(emit.constant(0.0), scratch, index)
         row = _Row(self, emit, emit.pointer(scratch, self.row_0_offset))
@@ -292,7 +291,7 @@ class LaneSeries:
             emit.store(quantities.sum(*expr), scratch, self.rhs_offset + index)
 
     def write_order(self, emit: LaneEmitter, k: Value, unit: Value, out: Value, scratch: Value) -> None:
-        """Write code that stores coefficient k + 1 of q in `out`, and the row of order k > 0 in `scratch`.
+        """Write code that stores coefficient k + 1 of q in `out`, and coefficients k > 0 of all factors in `scratch`.
 
         `unit`: unit of time of the series (s). The code first solves for coefficient k - 1 of the accelerations.
         """
@@ -383,11 +382,11 @@ class LaneSeries:
                 row.store((((result, 1.0),), 0.0), value, "if used")
 
     def _write_sums(self, emit: LaneEmitter, scratch: Value, k: Value) -> dict[tuple[tuple[int, int], bool], Value]:
-        """Write loops for sums over 1 < j < k: of X[j] Y[k - j] for order k, of X[j] Y[k + 1 - j] for order k + 1.
+        """Write loops that add up products of coefficients of series: X[j] Y[k - j] or X[j] Y[k + 1 - j], 1 < j < k.
 
-        Keys of the returned dict: ((index of factor X, index of factor Y), whether the sum is for order k + 1); values:
-        the sums. The terms j = 1 and j = k need the newest coefficients: `_PartialSums` adds them later, so that the
-        loops do not wait for these coefficients. One loop computes several sums, and loads each row only once.
+        Keys of the returned dict: ((index of factor X, index of factor Y), True for Y[k + 1 - j]); values: the sums.
+        The terms j = 1 and j = k need the newest coefficients: `_PartialSums` adds them later, so that the loops do not
+        wait for these coefficients. One loop computes several sums, and loads each row only once.
         """
         keys = [(pair, True) for pair in self.carried_pairs]
         pairs = {pair for each in (*self.early, *self.late) for pair in self._factors(each)}
@@ -424,7 +423,7 @@ class LaneSeries:
     ) -> None:
         """Write code for coefficient k = `order` > 0 of the results of `operations`; `inverse`: 1 / k.
 
-        PENDING products have a second factor whose coefficient k is not known yet: the term with it is left out.
+        A PENDING product has a second factor whose coefficient k is not known yet: the term with it is left out.
         """
         pairs = list(dict.fromkeys(pair for operation in operations for pair in self._factors(operation)))
         sums = {}
@@ -471,14 +470,14 @@ class LaneSeries:
 
 
 class _Row:
-    """Row in memory: coefficients of one order, one of each factor; what `store` has written is not loaded again."""
+    """Row in memory with the coefficients of one order, one for each factor; values that were stored are not loaded."""
 
     def __init__(self, code: LaneSeries, emit: LaneEmitter, base: Value):
         self.code, self.emit, self.base = code, emit, base
         self._stored: dict[int, Value] = {}
 
     def store(self, key: Any, value: Value, when: str = "") -> None:
-        """Store a coefficient of the factor `key`; if `when` is "if used", only if a product has this factor."""
+        """Store the coefficient of the factor `key`; if `when` is "if used", only if a product has this factor."""
         index = self.code.factor_indices.get(tuple(key)) if when else self.code.factor_indices[tuple(key)]
         if index is not None and index not in self._stored:
             self._stored[index] = value
@@ -492,8 +491,8 @@ class _Row:
 class _PartialSums(NamedTuple):
     """Sums of X[j] Y[k - j] over 1 < j < k, and the rows needed to add the terms j = 1 and j = k, which are missing."""
 
-    sums: dict[tuple[tuple[int, int], bool], Value]  # keys: ((X, Y), whether for order k + 1); X, Y: indices
-    first_row: Value  # pointer to the row of order 1; if k is 1, to a row of zeros: sums then have a term less
+    sums: dict[tuple[tuple[int, int], bool], Value]  # see `LaneSeries._write_sums`
+    first_row: Value  # pointer to the row of order 1; if k is 1, to a row of zeros: the product with it is 0
     row_1: Value  # pointer to the row of order 1
     row_before: _Row  # row of order k - 1
 

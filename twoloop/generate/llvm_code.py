@@ -6,7 +6,7 @@ inline, so that the processor computes the sines and cosines of several angles i
 
 The code reads coefficients from memory, so that all mechanisms with the same structure of the equations share it.
 
-LLVM compiles short blocks of instructions faster. So long functions may be split into parts (`Module.splits_blocks`).
+LLVM compiles short blocks of instructions faster. So the blocks of long functions may be split into parts.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -81,7 +81,7 @@ class Emitter:
         return constant(self.integer_type, value, self.builder)
 
     def coefficient(self, number: float) -> Value:
-        """Return a literal, or a Coefficient loaded from the array `numbers`, which does not change during a call."""
+        """Return `number` as a literal; if it is a Coefficient, load it from the array `numbers`."""
         if not isinstance(number, Coefficient):
             return self.constant(number)
         return self.load(self.numbers, number.index, constant=True)
@@ -95,7 +95,7 @@ class Emitter:
         return self.builder.call(f"llvm.fma.{self.suffix}", a.type, [a, b, c])
 
     def polynomial(self, coefficients: Sequence[float], x: Value) -> Value:
-        """Return the value of a polynomial at x, by pairs of terms in parallel; `coefficients`: lowest power first."""
+        """Return the value at x of a polynomial, whose `coefficients` begin with the lowest power."""
         square, terms = self.builder.operation("fmul", x, x), [self.load_constant(each) for each in coefficients]
         pairs = [self.fma(second, x, first) for first, second in zip(terms[::2], terms[1::2], strict=False)]
         pairs += terms[2 * len(pairs) :]
@@ -216,7 +216,7 @@ class Quantities:
         return loaded[quantity]
 
     def mark_stored(self, quantity: int) -> None:
-        """Note that a quantity is stored: later parts of the function load it from memory, but not the current part."""
+        """Note that a quantity was stored: later parts of a split function load it, to need fewer registers."""
         self._loaded_in_part()[quantity] = self._values.pop(quantity)
 
     def _loaded_in_part(self) -> dict[int, Value]:
@@ -393,14 +393,14 @@ class Lowering(Algebra[Value]):
         return arrays
 
     def expressions(self, graph: Graph, exprs: Sequence[Affine]) -> list[Value]:
-        """Return the values of expressions, after writing code for their quantities that were not computed before."""
+        """Write code for expressions, and for quantities in them that were not computed before; return the values."""
         quantities = graph.quantities_by_use(exprs, self._computed_quantities)
         self.run(graph, quantities)
         self._computed_quantities.update(quantities)
         return [self.affine(expr) for expr in exprs]
 
     def is_valid(self, program: Program, values: Sequence[Value]) -> Value:
-        """Write code for a flag, and return it: the conditions hold, `values` are finite, |angles| < LARGEST_ANGLE."""
+        """Write code for a flag, and return it: 1 if conditions hold, `values` are finite, |angles| < LARGEST_ANGLE."""
         emit, builder, zero = self.emit, self.emit.builder, self.emit.constant(0.0)
         total = zero
         for value in values:  # values that are not finite make the sum NaN

@@ -140,12 +140,12 @@ def undefined(kind: str) -> Value:
 class Module:
     """LLVM module: functions, and declarations of the other functions that they call.
 
-    `splits_blocks`: whether long blocks are split. The compile time of a block grows faster than its length.
+    `splits_blocks`: True if long blocks are split, because the compile time of a block grows faster than its length.
     """
 
     def __init__(self, splits_blocks: bool = False) -> None:
         self.splits_blocks = splits_blocks
-        self.block_addresses: list[str] = []  # addresses of blocks that LLVM must not merge
+        self.block_addresses: list[str] = []  # addresses of parts of blocks that were split: LLVM must not merge these
         self._tables: list[str] = []
         self._numbers: list[float] = []  # numbers that `Builder.load_constant` loads
         self._declared: dict[str, str] = {}
@@ -158,7 +158,7 @@ class Module:
         return builder
 
     def defines(self, name: str) -> bool:
-        """Return whether the module contains a function of this name, not only its declaration."""
+        """Return True if the module contains a function of this name, not only its declaration."""
         return any(function.name == name for function in self._functions)
 
     def add_table(self, indices: Sequence[int]) -> Value:
