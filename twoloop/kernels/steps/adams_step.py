@@ -1,4 +1,4 @@
-"""Step of the Adams methods, orders 1 to 12, for all coordinates: predict, evaluate, correct, evaluate.
+"""Attempt steps of the Adams methods of orders 1 to 12: predict, evaluate, correct, evaluate, for all coordinates.
 
 Order and step size are variable. The history consists of modified divided differences phi_i of the accelerations, as in
 Krogh's DVDQ and Shampine and Gordon's STEP, here for second-order equations: velocities are the integral of the
@@ -6,11 +6,11 @@ polynomial through the accelerations, and positions are its double integral. The
 state, which is near the constraints, but not on them; the second is at the corrected state, projected onto the
 constraints. Differences of all coordinates are stored, so that a new partition needs no conversion.
 
-Notation: t_n are the times of accepted steps, psi_i(n) = t_n - t_{n-i}, psi_0 = 0, and i counts from 1 as in the
-literature; beta_i = prod_{j<i} psi_j(n+1) / psi_j(n). In the step, for s from 0 to 1, the polynomial through the last k
-accelerations is sum_i c_i(s) beta_i phi_i(n), with c_i(s) = prod_{j=0}^{i-2} (s h + psi_j(n)) / psi_{j+1}(n+1).
-g_i = int c_i ds is the coefficient for velocities, G_i = int (1 - s) c_i ds is the coefficient for positions. All
-factors in these integrals are positive. `f` is the kit, and `w` the workspace.
+Notation: t_n are the times of accepted steps, h = t_{n+1} - t_n, psi_i(n) = t_n - t_{n-i}, psi_0 = 0; i counts from 1,
+as in the literature. At the time t_n + s h, the polynomial through the last k accelerations is the sum over i of
+c_i(s) beta_i phi_i(n), with beta_i = prod_{j<i} psi_j(n+1) / psi_j(n) and
+c_i(s) = prod_{j=0}^{i-2} (s h + psi_j(n)) / psi_{j+1}(n+1). Its integrals have the coefficients g_i = int c_i ds for
+velocities, and G_i = int (1 - s) c_i ds for positions. `f` is the kit, and `w` the workspace.
 """
 
 import numpy as np
@@ -24,14 +24,14 @@ HIGHEST = 12  # largest order, as in Shampine and Gordon's STEP; the quadrature 
 N_TERMS = HIGHEST + 2  # number of stored differences of accelerations, and of their coefficients for v and for q
 ERROR_FACTOR = 5.0  # factor on the error estimate, because the errors of many short steps add up
 SAFETY = 0.8  # safety factor: ratio of the next step size to the size for which the estimate would equal the tolerance
-GROWTH, SHRINKAGE = 1.2, 0.5  # largest ratio of successive step sizes, and smallest after a rejection
+GROWTH, SHRINKAGE = 1.2, 0.5  # largest ratio of successive step sizes; smallest ratio after a rejected step
 START_GROWTH = 2.0  # largest ratio of successive step sizes while the order still rises with every step
 LEAST_FACTOR = 0.1  # smallest ratio of successive step sizes if a predicted position is far from the constraints
 RESTART_AFTER = 3  # number of successive rejected steps after which the method restarts with order 1
 
 # eight Gauss nodes on [0, 1] and their weights: this quadrature is exact for polynomials up to degree 15
 NODES, WEIGHTS = (0.5 * (1.0 + x) if k == 0 else 0.5 * x for k, x in enumerate(np.polynomial.legendre.leggauss(8)))
-POSITION_WEIGHTS = WEIGHTS * (1.0 - NODES)  # weights of the values c_i(s) at NODES in the integral of (1 - s) c_i(s)
+POSITION_WEIGHTS = WEIGHTS * (1.0 - NODES)  # weights of the values of c(s) at NODES in the integral of (1 - s) c(s)
 
 
 def _error_constants():
@@ -49,21 +49,21 @@ def _error_constants():
 # smaller, and would underestimate the error if the force jumps
 ERROR_CONSTANTS = _error_constants()
 
-# indices in `options`. THETA: a projection has converged if its last correction is at most THETA, see `project`
-THETA, N_OPTIONS = range(2)
+THETA, N_OPTIONS = range(2)  # index in `options`: tolerance at which projections end, see `project`
 # indices of the scalars in `memory`. After the scalars, `memory` contains N_ROWS rows of coefficients, two tables of
 # differences, and two scratch rows, see _row, _difference_table and _scratch_rows
 (
-    CURRENT,  # index, 0 or 1, of the table of differences at the last accepted step; the other one is the attempt's
+    CURRENT,  # number, 0 or 1, of the table of differences at the last accepted step; the other: of the attempted step
     ORDER,  # order of the next attempt
     DEPTH,  # number of accelerations in the history, at most N_TERMS
     AGE,  # number of accepted steps since the last change of the order or the last rejected step
-    STARTING,  # 1: the order rises with every step
+    STARTING,  # 1: the run begins, and the order rises with every step; 0: error estimates choose the order
     FAILED,  # number of successive rejected attempts
     NEXT_ORDER,  # order chosen at the end of an attempt for the next one
     N_SCALARS,
 ) = range(8)
-# indices of rows: time spans psi(n) and psi(n+1), factors beta, coefficients g (for v) and G (for q), c_i at NODES
+# indices of rows in `memory` (symbols: see above). PSI, NEW_PSI: times psi(n), psi(n+1) (s). BETA: factors beta.
+# G_VELOCITY, G_POSITION: coefficients g for velocities and G for positions. C_AT_NODES: values of one c_i at NODES
 PSI, NEW_PSI, BETA, G_VELOCITY, G_POSITION, C_AT_NODES, N_ROWS = range(7)
 
 
@@ -87,7 +87,7 @@ def _row(memory, index):
 def _difference_table(memory, n, index):
     """Return a view of table `index` (0 or 1) of differences: N_TERMS + 1 rows of n entries, padded.
 
-    The difference phi_i of the accelerations is row i - 1 plus the last row.
+    Row i - 1 is the predicted difference phi_i of the accelerations. The last row, added to it, corrects it.
     """
     width = (n + 3) // 4 * 4
     start = N_SCALARS + N_ROWS * (N_TERMS + 2) + int(index) * (N_TERMS + 1) * width
@@ -96,7 +96,7 @@ def _difference_table(memory, n, index):
 
 @inlined
 def _scratch_rows(memory, n):
-    """Return two scratch rows (n, padded), for v and for q: mean accelerations, or later reciprocals of tolerances."""
+    """Return two scratch rows (n, padded), for v and for q: mean accelerations, later 1 / (allowed errors)."""
     width = (n + 3) // 4 * 4
     start = N_SCALARS + N_ROWS * (N_TERMS + 2) + 2 * (N_TERMS + 1) * width
     return memory[start : start + width], memory[start + width : start + 2 * width]
@@ -104,7 +104,7 @@ def _scratch_rows(memory, n):
 
 @kernel(COMMIT)
 def commit_adams(f, w, options, memory, tolerances, accepted):
-    """Add an accepted attempt to the history in `memory`; after a rejected attempt, reduce the order or restart."""
+    """Add an accepted attempt to the history in `memory`; after a rejected one, reduce the order or restart."""
     if not accepted:
         memory[FAILED] += 1.0
         memory[AGE] = 0.0
@@ -139,7 +139,7 @@ def _begin_history(memory, n, state):
 
 @merged
 def _compute_coefficients(memory, h, k):
-    """Store time spans psi(n+1), factors beta, coefficients g for v and G for q, for a step of size h at order k."""
+    """Store the coefficients of a step of size h at order k in `memory`: psi(n+1), beta, g for v, and G for q."""
     psi, new_psi, beta = _row(memory, PSI), _row(memory, NEW_PSI), _row(memory, BETA)
     g, G, c = _row(memory, G_VELOCITY), _row(memory, G_POSITION), _row(memory, C_AT_NODES)
     new_psi[0] = h
@@ -168,7 +168,7 @@ def _compute_coefficients(memory, h, k):
 
 @merged
 def _predict_state(memory, h, k, old, new, state, q1, v1, n):
-    """Predict (q1, v1) after a step of size h at order k from the table `old`; store predicted differences in `new`."""
+    """Predict (q1, v1) after a step of size h at order k from differences `old`; store predicted ones in `new`."""
     beta, g, G = _row(memory, BETA), _row(memory, G_VELOCITY), _row(memory, G_POSITION)
     mean_v, mean_q = _scratch_rows(memory, n)
     for m in range(0, old.shape[1], 4):
@@ -226,14 +226,14 @@ def _predict_state(memory, h, k, old, new, state, q1, v1, n):
 def _estimate_error(g, G, h, order, largest_v, largest_q):
     """Return the estimated error of a step at `order`, in units of the tolerances; g, G: coefficients for v and for q.
 
-    `largest_v`, `largest_q`: largest component of phi_{order+1} over the tolerances of velocities, and of positions.
+    `largest_v`, `largest_q`: largest |component| of phi_{order+1} / tolerance, for velocities and for positions.
     """
     return max(h * abs(g[order - 1] - g[order]) * largest_v, h * h * abs(G[order - 1] - G[order]) * largest_q)
 
 
 @merged
 def _choose_order(memory, h, k, table, d, n):
-    """Store NEXT_ORDER; return the estimated error, in tolerances, and the ratio of the next step size to h.
+    """Choose the next order (NEXT_ORDER); return the estimated error, in tolerances, and (next step size) / h.
 
     The rules are taken from STEP (Shampine and Gordon). The order k decreases if the estimates at lower orders are not
     larger. It increases if k + 1 steps had the order k and the estimate at order k + 1 is smaller. While STARTING is 1,
@@ -282,7 +282,7 @@ def _choose_order(memory, h, k, table, d, n):
 
 @kernel(ATTEMPT, vectorized=True)
 def adams_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """Attempt a step of size h; choose the order and the size of the next step."""
+    """Attempt a step of size h by an Adams method; choose the order and the size of the next step."""
     n = w.Q.size
     q, v = state[:n], state[n : 2 * n]
     q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]

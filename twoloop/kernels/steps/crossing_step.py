@@ -5,7 +5,7 @@ on independent coordinates do not converge there, nor do iterations whose stages
 collocation at Gauss nodes whose stages are projected onto the constraints. Then the accelerations are those of the
 motion, and the fixed-point iteration converges as it does elsewhere.
 
-- At a relative distance s from the position (a ratio of pivots), rounding errors are eps/s in positions, eps/s^2 in
+- If the smallest pivot of C_q is s times the largest of the run, rounding errors are eps/s in positions, eps/s^2 in
   velocities and eps/s^3 in accelerations (eps: machine epsilon). Nodes with too large rounding errors are left out:
   their accelerations are interpolated from nodes on both sides, because the motion through the position is analytic.
 - The result depends on q and v at the beginning only: the accelerations there may consist of rounding errors.
@@ -26,7 +26,8 @@ from twoloop.kernels.evaluation.inner_loop import evaluate_state, project, renew
 from twoloop.kernels.linalg.dense import copy, sum_rows
 from twoloop.kernels.steps.stages import lagrange_values
 
-# indices of scalars in `options`. The Gauss tableau follows: A, A @ A, Legendre weights (S, S each), b, b @ A, c (S)
+# indices in `options`: tolerances of the inner loop and of projections. The Gauss tableau follows: A, A @ A, weights of
+# the Legendre coefficients (S, S each); b, b @ A, c (S each)
 INNER_TOL, THETA, N_SCALARS = range(3)
 S = 20  # number of Gauss nodes, which are the stages
 # the iteration has converged when a sweep changes accelerations by at most CONVERGED_CHANGE tolerances
@@ -34,10 +35,8 @@ CONVERGED_CHANGE = 0.01
 # the iteration has also converged if a sweep changes accelerations by at most STALL_CHANGE tolerances, and by at least
 # STALL_RATIO times the change by the sweep before: rounding errors then keep the change from decreasing
 STALL_RATIO, STALL_CHANGE = 0.5, 0.3
-# MAX_SWEEPS: largest number of sweeps; FEW_SWEEPS: number of sweeps after which more nodes are left out
-MAX_SWEEPS, FEW_SWEEPS = 40, 12
-# nodes with pivots below a limit are left out; after FEW_SWEEPS sweeps without convergence, this multiplies the limit
-DISTANCE_FACTOR = 2.0
+MAX_SWEEPS, FEW_SWEEPS = 40, 12  # numbers of sweeps after which a step fails, and after which more nodes are left out
+DISTANCE_FACTOR = 2.0  # after FEW_SWEEPS sweeps, the pivot below which nodes are left out is multiplied by this
 MAX_LEFT_OUT_NODES = 9  # the step fails if more nodes are left out
 # indices of the scalars at the end of `memory`. LARGEST_PIVOT, EARLIEST, MAY_APPROACH, NODE_DISTANCE, BASE (a time, s):
 # arguments of `begin_polynomial`. BEGIN, DURATION, END (s): of the polynomial of the last converged attempt; if there
@@ -45,16 +44,15 @@ MAX_LEFT_OUT_NODES = 9  # the step fails if more nodes are left out
 LARGEST_PIVOT, EARLIEST, MAY_APPROACH, NODE_DISTANCE, BASE, BEGIN, DURATION, END, N_STORED = range(9)
 # duration of the shortest and of the longest step along the polynomial, relative to the duration of the polynomial
 SHORTEST_PIECE, LONGEST_PIECE = 0.05, 0.2
-# longest time between two evaluations if all nodes are evaluated, relative to the duration of the polynomial
-NODE_GAP = 0.0767
-BACKWARD_FRACTION = 0.4  # duration of the polynomial before the beginning of the step, relative to its whole duration
+NODE_GAP = 0.0767  # longest time between two successive nodes, relative to the duration of the polynomial
+BACKWARD_FRACTION = 0.4  # largest part of the polynomial that precedes the step, relative to its whole duration
 ORDER, ERROR_FACTOR = 12.0, 0.5  # the error estimate is about proportional to h^ORDER; factor on the estimate
 # if a projection changes a stage by x tolerances, the error estimate of the step is at least PROJECTION_WEIGHT x
 PROJECTION_WEIGHT = 0.5
 ROUNDING = 1e-13  # relative tolerance of the iteration in steps of fixed size, and of comparisons of times
 MIN_PIVOT_RATIO = 0.5  # a step fails if the pivot at its end is below this * pivot at its beginning; see FAR_END
-END_MARGIN = 2.0  # a step fails if the pivot at its end is below this * limit of pivots of evaluated nodes; see FAR_END
-FAR_END = 0.3  # MIN_PIVOT_RATIO and END_MARGIN do not matter if the pivot at the end is at least this * largest pivot
+END_MARGIN = 2.0  # a step fails if the pivot at its end is below this * pivot of nodes that are left out; see FAR_END
+FAR_END = 0.3  # no step fails if the smallest pivot of C_q at its end is at least this * largest pivot of the run
 LATE = S - 4  # node near the end: if the pivot is larger there than at the end, the end is before the singular position
 # an attempt that computes a polynomial returns this as error and as ratio of the next step size. As the error is above
 # 1, the step is repeated, and takes a piece of the polynomial
@@ -75,7 +73,7 @@ def memory_size(n):
 
 
 def begin_polynomial(memory, largest_pivot, earliest, may_approach, node_distance=1.0, base=None):
-    """Store the conditions for the next polynomial in `memory`, and discard the stored polynomial.
+    """Discard the polynomial in `memory`, and store the conditions that the next one must satisfy.
 
     `largest_pivot` is the largest pivot of the run so far; no node may lie before the time `earliest` (s). If
     `may_approach`, the polynomial may end before the singular position, nearer to it than it begins. `node_distance`
@@ -93,7 +91,7 @@ def begin_polynomial(memory, largest_pivot, earliest, may_approach, node_distanc
 
 
 def piece_ends(memory, c, t):
-    """Return the times (s) after t at which the pieces of the polynomial in `memory` end.
+    """Divide the polynomial in `memory` into the next steps ("pieces"); return the times (s) after t at which they end.
 
     Pieces end at the end of the polynomial, at evaluated nodes next to a node that is left out, and at evaluated nodes
     where the piece would otherwise be longer than LONGEST_PIECE. No piece is shorter than SHORTEST_PIECE.
@@ -163,7 +161,7 @@ def _integrate_polynomial(h, c, A, AA, a, q, v, q_end, v_end):
 
 @compiled
 def _widest_gap(c, c0, kept):
-    """Return the widest gap in [c0, 1] between evaluated nodes: those of the nodes c for which kept >= 0."""
+    """Return the widest gap between evaluated nodes (kept[k] >= 0) in [c0, 1], the step's part of the polynomial."""
     widest, before = 0.0, c0
     for k in range(S):
         if kept[k] >= 0.0 and c[k] > c0:
@@ -179,7 +177,7 @@ def _choose_partition_at_end(
 
     The code is SINGULAR if the end is close to the singular position, or before it: its pivot is below FAR_END times
     the largest pivot, and below a second limit. This limit is `min_pivot`; if MAY_APPROACH is 0, it is the largest of
-    `min_pivot`, END_MARGIN times `min_node_pivot`, and the pivot at the node LATE. (q_late, v_late): scratch.
+    `min_pivot`, END_MARGIN times `min_node_pivot` (below which nodes are left out), and the pivot at the node LATE.
     """
     A, AA, b, bA, c = tables
     if stored[MAY_APPROACH] == 0.0:
@@ -193,7 +191,7 @@ def _choose_partition_at_end(
 
 @compiled
 def _fill_integral_weights(b, c, c0, weights_v, weights_q):
-    """Store the weights (S) of accelerations at nodes c in their integral and double integral up to the time c0."""
+    """Store weights (S) of a polynomial's values at the nodes c in its integral and double integral from 0 to c0."""
     weights_v[:] = 0.0
     weights_q[:] = 0.0
     for i in range(S):
@@ -218,7 +216,7 @@ def _set_beginning_state(h, c0, weights_v, weights_q, a, q, v, q_0, v_0):
 
 @compiled
 def _interpolate(x, c, nodes, a, value):
-    """Set `value` (n) to the value at x of the polynomial through a[k] (n) at c[k], for all k >= 0 in `nodes`."""
+    """Set `value` (n) to the value at x of the polynomial that is a[k] (n) at c[k] for all k in `nodes` except -1."""
     value[:] = 0.0
     for node in nodes:
         if node >= 0:
@@ -232,7 +230,7 @@ def _interpolate(x, c, nodes, a, value):
 
 @compiled
 def _polynomial_at(time, duration, b, c, a, q_0, v_0, weights_v, weights_q, q, v, acceleration):
-    """Set q, v and `acceleration` (n each) to the values of the polynomial `time` seconds after its beginning."""
+    """Set q, v and `acceleration` (n each) to the motion along the polynomial `time` seconds after its beginning."""
     fraction = time / duration
     _fill_integral_weights(b, c, fraction, weights_v, weights_q)
     sum_rows(weights_v, a, v)
@@ -245,7 +243,7 @@ def _polynomial_at(time, duration, b, c, a, q_0, v_0, weights_v, weights_q, q, v
 
 @merged
 def _finish_piece(f, w, t, min_node_pivot, options, tolerances, stage, state, new_state):
-    """Store `stage`, a state [q, v, a], projected onto the constraints, in `new_state`; return an Attempt.
+    """Project `stage`, the state [q, v, a] at the end of a step, onto the constraints: `new_state`. Return an Attempt.
 
     If `min_node_pivot` is positive, and the smallest pivot is below it or the projection fails, the state is stored
     without projection.
@@ -292,7 +290,7 @@ def state_at(memory, options, t):
 
 @kernel(ATTEMPT)
 def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """Attempt a step: take a piece of the polynomial in `memory`, or compute a polynomial if none covers the step."""
+    """Attempt a step along the polynomial in `memory`; if it ends before the step does, compute a new polynomial."""
     n = w.Q.size
     q, v, q1, v1 = state[:n], state[n : 2 * n], new_state[:n], new_state[n : 2 * n]
     A, AA, legendre = options[N_SCALARS : N_SCALARS + 3 * S * S].reshape((3, S, S))

@@ -1,4 +1,4 @@
-"""Diagonally implicit Runge-Kutta steps with an explicit first stage (ESDIRK), for stiff problems and low accuracy.
+"""Attempt diagonally implicit Runge-Kutta steps with an explicit first stage (ESDIRK), for stiffness and low accuracy.
 
 The stages are solved one after another. For stage j of the tableau a_jk, with the diagonal entry gamma, Newton's method
 finds the accelerations a of the independent coordinates. F are the accelerations that the inner loop returns,
@@ -16,9 +16,9 @@ newton_step.py, which solves all stages together, uses one set of derivatives fo
 multiplies derivatives by the inverse of T^T M T. For a matrix that is used in one iteration, this is twice the work.
 
 Under step-size control, a step of TR-BDF2 (order 2) ends close to the result of its embedded formula of order 3: the
-difference of both results is filtered, by (I - z J)^-1 with the Jacobian J, and then subtracted from the first. The
-filter keeps the method L-stable. The tolerance limits the difference, but the error of a step is smaller. So the errors
-of many short steps add up to about the tolerance, not to the tolerance times their number. `f`: kit, `w`: workspace.
+difference of both results is multiplied by filters (I - z J)^-1 with the Jacobian J, and then subtracted from that of
+order 2. The filter keeps the method L-stable. The tolerance limits the difference, but the error of a step is smaller:
+errors of many short steps add up to about the tolerance, not to a multiple of it. `f`: kit, `w`: workspace.
 """
 
 import numpy as np
@@ -85,7 +85,7 @@ def _fill_newton_matrix(w, memory, n, m, z, H):
 
 @compiled
 def factor_newton_matrix(w, memory, z):
-    """Factor T^T (M - z^2 K - z D) T, z = gamma h, with the derivatives of forces computed last; return a code."""
+    """Factor the matrix of `_fill_newton_matrix`, with the derivatives of forces computed last; return a code."""
     n, m = w.Q.size, w.independent.size
     storage = matrix_storage(w, n, at.FILTER)
     H = as_matrix(storage, m)
@@ -103,7 +103,7 @@ def factor_newton_matrix(w, memory, z):
 
 @compiled
 def compute_and_factor_matrix(f, w, memory, t, q, v, z):
-    """Compute K and D, the derivatives of forces, at (t, q, v), and factor T^T (M - z^2 K - z D) T; return a code.
+    """Compute the derivatives of forces at (t, q, v), and factor the matrix of `_fill_newton_matrix`; return a code.
 
     The last evaluation must have been at (t, q, v), w.lam must be the multipliers there. z: step size times gamma.
     """
@@ -131,7 +131,7 @@ def compute_and_factor_matrix(f, w, memory, t, q, v, z):
 
 @compiled
 def _solve_newton_system(w, memory, x):
-    """Replace x (n_dof), a right-hand side of Newton's equations, by the solution; see `factor_newton_matrix`."""
+    """Replace x (n_dof), a right-hand side, by the solution, using the factors from `factor_newton_matrix`."""
     m = x.size
     H = as_matrix(matrix_storage(w, w.Q.size, at.FILTER), m)
     if memory[at.IS_SYMMETRIC] == 1.0:
@@ -162,7 +162,7 @@ def correct_stage(w, memory, residual, a):
 
 @compiled
 def filter_dense_error(w, memory, z, e_q, e_v):
-    """Filter e_v, an error estimate of v, given e_q, that of q, as `filter_error` does; use `factor_newton_matrix`."""
+    """Remove stiff components from e_v as `filter_error` does; e_q, e_v: estimated errors of independent q and v."""
     n = w.Q.size
     m = e_q.size
     N, Kr = as_matrix(matrix_storage(w, n, at.SYSTEMS), m), as_matrix(matrix_storage(w, n, at.DERIVATIVE_Q), m)
@@ -178,10 +178,9 @@ def filter_dense_error(w, memory, z, e_q, e_v):
 
 MAX_ITERATIONS = 8  # largest number of Newton iterations of a stage: if they do not converge, the step fails
 DIVERGENCE_RATIO = 2.0  # Newton's method has diverged if a correction exceeds this multiple of the previous one
-LINEAR_FACTOR = 0.01  # factor on Newton's tolerance if derivatives are differences: convergence is then only linear
-# derivatives computed by differences are renewed if a Newton correction exceeds this fraction of the previous one
-MAX_CONTRACTION = 0.1
-VELOCITY_WEIGHT = 0.1  # factor, in Newton's convergence test, on the deviation in q that an inaccurate v causes later
+LINEAR_FACTOR = 0.01  # factor on Newton's tolerance if derivatives are finite differences: convergence is then linear
+MAX_CONTRACTION = 0.1  # finite differences are renewed if a Newton correction exceeds this fraction of the previous one
+VELOCITY_WEIGHT = 0.1  # Newton's test counts this fraction of the later error in q that a correction of v prevents
 
 
 @inlined
@@ -204,7 +203,7 @@ def gamma_of(options):
 
 @merged
 def has_dense_tangents(f, w):
-    """Return True if Newton iterations compute tangents K, D and factor the dense matrix T^T (M - z^2 K - z D) T."""
+    """Return True if each Newton iteration computes derivatives of forces, and factors T^T (M - z^2 K - z D) T anew."""
     return f.force_by_q_given == 1 and f.bandwidth < 0 and w.Rate.size == w.C.size and f.form != FIXED_ORDER
 
 
@@ -216,7 +215,7 @@ def stages_at_once(options):
 
 @compiled
 def _update_derivatives(f, w, options, memory, t, h, Q, V, F):
-    """Renew, if outdated, derivatives of accelerations (F at the state t, Q, V) and Newton's factors; return a code."""
+    """Renew outdated derivatives, at the state (t, Q, V) with accelerations F, and Newton's factors; return a code."""
     if f.force_by_q_given == 1 or memory[at.HAS_JACOBIAN] == 0.0:
         multipliers(f, w, t, Q, V, F, w.lam)
         memory[at.HAS_JACOBIAN] = 1.0
@@ -311,10 +310,10 @@ MAX_RATIO_BY_ONE_JUMP = 0.174
 
 @compiled
 def _filter_errors(f, w, options, memory, h, e_q, e_v):
-    """Remove stiff components: replace (e_q, e_v) by (I - z J)^-1 (e_q, e_v), z = h gamma, using the last factors.
+    """Remove stiff components of estimated errors: replace (e_q, e_v) by (I - z J)^-1 (e_q, e_v), by the last factors.
 
-    J is the Jacobian of velocities and accelerations by (q_i, v_i). The estimated errors of q and v are the first n_dof
-    entries of e_q and e_v (n_q); the other entries are scratch.
+    z = h gamma; J is the Jacobian of velocities and accelerations by (q_i, v_i). The estimated errors of q and v are
+    the first n_dof entries of e_q and e_v (n_q); the other entries are scratch.
     """
     z = h * gamma_of(options)
     n_dof = w.independent.size
@@ -336,9 +335,9 @@ def _factor_filter(f, w, options, memory, h):
 
 @compiled
 def _store_weighted_sums(w, h, V_stage, A_stage, weights, factor, e_q, e_v):
-    """Store h * factor * sum_k weights[k] * V_stage[k] in e_q, and the same sum of A_stage[k] in e_v.
+    """Store an error estimate: h * factor * sum_k weights[k] * V_stage[k] in e_q, the same with A_stage[k] in e_v.
 
-    Only sums for independent coordinates are computed; they become the first n_dof numbers of e_q and e_v (n_q).
+    Only independent coordinates are included: theirs are the first n_dof numbers of e_q and e_v (n_q).
     """
     for i in range(w.independent.size):
         j = w.independent[i]
@@ -352,7 +351,7 @@ def _store_weighted_sums(w, h, V_stage, A_stage, weights, factor, e_q, e_v):
 
 @compiled
 def _renew_derivatives(f, w, options, memory, t, h, new_state):
-    """Compute derivatives at t and `new_state`; factor Newton's matrices for steps of size h; return a code."""
+    """Compute derivatives at the end (t, `new_state`) of a step of size h; factor Newton's matrices; return a code."""
     n = w.Q.size
     Q, V, F = vector(memory, 1, n, at.Q_MID), vector(memory, 1, n, at.V_MID), vector(memory, 1, n, at.A_MID)
     copy(new_state[:n], Q)
@@ -373,7 +372,7 @@ def _renew_derivatives(f, w, options, memory, t, h, new_state):
 
 @compiled
 def _estimate(f, w, options, memory, t, h, tolerances, state, new_state, V_stage, A_stage, weights, factor):
-    """Return the largest component of the error estimate of `_store_weighted_sums`, in units of the tolerances.
+    """Estimate the error of a step by `weights` of its stages; return its largest component, in units of tolerances.
 
     The estimate is filtered (Hosea and Shampine 1996), so that stiff components do not count. If outdated derivatives
     make the filter wrong, they are computed anew. E_Q and E_V in `memory` become the twice filtered estimate.
@@ -430,9 +429,9 @@ def _apply_embedded_formula(f, w, options, memory, h, q1, v1):
 
 @compiled
 def _error_in_slow_directions(f, w, options, memory, h, tolerances, state, new_state, A_stage):
-    """Return the effect, in tolerances, of the slow part of the estimated velocity error E_V, see newton_step.py.
+    """Return the effect, in tolerances, of the slowly decaying part of the estimated velocity error E_V in `memory`.
 
-    If the whole of E_V has an effect of at most 1, return 0. E_Q, E_V and the factors are overwritten.
+    If E_V has an effect of at most 1, return 0. E_Q, E_V and the factors are overwritten. See newton_step.py.
     """
     n = w.Q.size
     e_q, e_v = vector(memory, 1, n, at.E_Q), vector(memory, 1, n, at.E_V)
@@ -496,7 +495,7 @@ def commit_diagonal(f, w, options, memory, tolerances, accepted):
 def diagonal_step(f, w, options, memory, t, h, tolerances, state, new_state):
     """Attempt a step: solve for one stage after another.
 
-    The step ends at the last stage or, if an option says so, at the result of the embedded formula.
+    The step ends at the last stage or, if the last of `options` is 1, at the result of the embedded formula.
     """
     s = int(options[at.DIAGONAL_OFFSET])
     begin = at.DIAGONAL_OFFSET + 1
