@@ -45,7 +45,7 @@ H_BEFORE, ERROR_BEFORE, N_PAST = range(3)
     SYMMETRIC,  # 1: each step chooses the partition at its midpoint; 0: a partition is kept as long as it is good
     MAX_ATTEMPTS,  # number of attempted steps after which `advance` returns; its caller then checks progress and time
     # 1: near a singular position, `advance` returns NEAR_SINGULAR, and the caller crosses the position. 0: `advance`
-    # never does so. SUSPENDED: not near the present singular position; far from this position, it becomes 1 again
+    # never does so. SUSPENDED: it does not do so near the present singular position; far from it, 1 is stored again
     MAY_CROSS,
     SHORTEST,  # steps must be longer than this (s), and longer than EQUAL_SPACINGS spacings of floating-point times
     MAY_SWITCH,  # 1: `advance` returns SWITCH_METHOD if a value is not finite, or a step returns UNSUITED; 0: never

@@ -33,7 +33,7 @@ PASSED_PIVOT_RATIO = 0.6
 # MIN_NEAR_RATIO, MAX_NEAR_RATIO: limits of the result of `near_pivot_ratio`. MAX_ROUNDING_ERROR: allowed rounding error
 # near a singular position, in tolerances. EPS: unit roundoff
 MIN_NEAR_RATIO, MAX_NEAR_RATIO, MAX_ROUNDING_ERROR, EPS = 0.02, 0.1, 0.2, 2.0**-53
-MIN_END_RATIO = 0.25  # `ends_near_singular` is False if a step leaves more than this fraction of the smallest pivot
+MIN_END_RATIO = 0.25  # `ends_near_singular` is True only if the smallest pivot is below this part of clock[PIVOT_HERE]
 
 
 @merged
@@ -91,7 +91,7 @@ def prepare_projected_repetition(f, w, control, clock, size):
 
 @merged
 def near_pivot_ratio(tolerances):
-    """Return the part of clock[LARGEST_PIVOT] below which a pivot makes rounding errors exceed MAX_ROUNDING_ERROR."""
+    """Return the part of clock[LARGEST_PIVOT] below which pivots let rounding errors exceed MAX_ROUNDING_ERROR."""
     return min(max(MIN_NEAR_RATIO, (EPS / (MAX_ROUNDING_ERROR * tolerances[LEAST])) ** (1.0 / 3.0)), MAX_NEAR_RATIO)
 
 

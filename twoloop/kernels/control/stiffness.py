@@ -50,31 +50,29 @@ from twoloop.kernels.data.indices import DONE, ESTIMATE, FIXED_ORDER, GAP, MAX_G
 from twoloop.kernels.evaluation.inner_loop import renew_partition
 from twoloop.kernels.linalg.dense import copy
 
-# the largest rate is first estimated after FIRST_ESTIMATE evaluations, then every BETWEEN_ESTIMATES evaluations. An
-# estimate takes about eight. While the explicit method is active, both numbers are multiplied by options[COST_RATIO]
+# the largest rate is first estimated after FIRST_ESTIMATE evaluations of the equations, then every BETWEEN_ESTIMATES.
+# An estimate takes about eight. While the explicit method is active, both numbers are multiplied by options[COST_RATIO]
 FIRST_ESTIMATE, BETWEEN_ESTIMATES = 100.0, 600.0
 N_POWER_ITERATIONS = 4  # number of power iterations by dF/dq per estimate (F: accelerations); largest number by dF/dv
-NEGLIGIBLE_DAMPING = 1e-3  # power iterations with dF/dv end early if the eigenvalue times the step size is below this
+NEGLIGIBLE_DAMPING = 1e-3  # power iterations by dF/dv end early if the eigenvalue times the step size is below this
 ZERO_REPLACEMENT = 1e-3  # replaces zero components of the vector of a power iteration, whose largest component is 1
 STABILITY_LIMIT = 3.0  # a trial begins at any cost if step size * (largest rate) exceeds this times its stability limit
 # if Jacobians are computed by finite differences (about eight evaluations per coordinate), a trial that STABILITY_LIMIT
 # does not require also waits until the run has cost this number of evaluations per independent coordinate
 MIN_COST_PER_COORDINATE = 64.0
 TRIAL_COST = 300.0  # approximate cost of a trial of the implicit method, in evaluations of the implicit method
-# a trial that STABILITY_LIMIT does not require waits until the run has cost as much as this number of trials
-MIN_COST_IN_TRIALS = 3.0
+MIN_COST_IN_TRIALS = 3.0  # a trial that STABILITY_LIMIT does not require waits until the run has cost this many trials
 COUNTED_FRACTION_OF_RUN = 0.3  # the cost so far counts as at least this fraction of the expected cost of the whole run
-# after the run has cost this multiple of MIN_COST_IN_TRIALS trials, a trial begins, whatever the largest rate rho is.
-# After k trials, the next one begins at k + 1 times this cost
+# when the run has cost this number times MIN_COST_IN_TRIALS trials, a trial begins, however small the largest rate is;
+# after k trials, when the run has cost k + 1 times as much
 COST_OF_ANY_TRIAL = 100.0
 MIN_RATIO_TO_MOTION = 30.0  # above this times `_motion_rate`, the largest rate is "hidden": the motion does not show it
 QUIET_FACTOR = 10.0  # vibrations count as small if their velocities are at most this number of tolerances
-# if the largest rate is hidden, or that of small vibrations, a trial begins if step size * (largest rate) exceeds this
-MIN_HIDDEN_RATIO = 0.05  # (relative to the stability limit)
+# step size * (largest rate) / LIMIT above which a trial begins if this rate is hidden, or is that of small vibrations
+MIN_HIDDEN_RATIO = 0.05
 DIFFERENCE_STEP = 1e-4  # time step of the finite difference in `_motion_rate`, relative to 1 / (largest rate)
 RETURN_BELOW = 0.4  # the explicit method is tried again if step size * (largest rate) is below this part of its limit
-# errors of the implicit method on trial are multiplied by this factor, so that it cannot win by making larger errors
-TRIAL_ERROR_FACTOR = 10.0
+TRIAL_ERROR_FACTOR = 10.0  # multiplies errors of the implicit method on trial, so that it cannot win by larger errors
 MEAN_WEIGHT = 0.8  # after a step: new mean step size = MEAN_WEIGHT * old mean + (1 - MEAN_WEIGHT) * size of the step
 N_UNMEASURED_STEPS = 5.0  # number of accepted steps at the beginning of a trial that do not count in its cost
 N_MEASURED_STEPS = 10.0  # number of accepted steps over which the cost of the method on trial is measured
@@ -93,20 +91,21 @@ EXPLICIT, ON_TRIAL, IMPLICIT, BACK_ON_TRIAL = range(4)
 # - SIZE_1: number of options of the first method
 LIMIT, N_ESTIMATES, MATRIX_COST, COST_RATIO, SIZE_1, N_PAIR = range(6)
 REUSE_OF, N_OF_EACH = N_RULE, N_RULE + 1
-N_OPTIONS = N_PAIR + 2 * N_OF_EACH
+N_OPTIONS = N_PAIR + 2 * N_OF_EACH  # index in `options` where the options of the first method begin
 
-# indices in `memory`: N_SCALARS numbers. Two vectors of power iterations (n_q) and both methods' memories follow them
+# indices of the first N_SCALARS numbers in `memory`; then two vectors (n_q) of power iterations, by dF/dq and by dF/dv,
+# and the memories of both methods
 (
-    PHASE,  # EXPLICIT, ON_TRIAL, IMPLICIT or BACK_ON_TRIAL
+    PHASE,  # method in use or on trial: EXPLICIT, ON_TRIAL, IMPLICIT or BACK_ON_TRIAL
     STEPS,  # number of accepted steps in this phase
     MAY_ESTIMATE,  # 1: the largest rate may be estimated, as the last attempted step was accepted; 0: it was rejected
     NEXT_ESTIMATE,  # number of evaluations since the start of the run after which the largest rate is estimated again
     ESTIMATES_TO_WAIT,  # number of estimates of the largest rate that must still follow before the next trial may begin
-    WAIT,  # value of ESTIMATES_TO_WAIT at the end of the last trial
+    WAIT,  # value of ESTIMATES_TO_WAIT at the end of the last trial; each unsuccessful trial doubles it
     T_BEGIN,  # time (s) at which the measurement of the cost per second began; NaN: it begins with the next step
-    COST_BEGIN,  # cost of the run up to the time T_BEGIN, in evaluations
+    COST_BEGIN,  # cost of the run up to the time T_BEGIN, in evaluations of the equations
     COST_PER_SECOND,  # cost of a second of motion before the last trial, in evaluations by the explicit method
-    RATE,  # last estimate of rho, the largest rate of the motion (1/s)
+    RATE,  # last estimate of the largest rate of the motion (1/s)
     FIRST_MEMORY,  # length of the memory of the first method
     H_MEAN,  # weighted mean of the last step sizes (s), see MEAN_WEIGHT
     HISTORY,  # first of two entries with the history of step-size control (see loop_state.py) in this phase
@@ -114,7 +113,8 @@ N_OPTIONS = N_PAIR + 2 * N_OF_EACH
     H_TRIED,  # size of the last attempted step (s)
     ERROR_TRIED,  # error of the last attempted step, in tolerances
     N_TRIALS,  # number of trials so far
-    N_ABOVE_LIMIT,  # number of estimates of h * rate above LIMIT; one below LIMIT sets it to 0 if trials are cheap
+    # number of estimates of step size * (largest rate) above LIMIT; one below it sets this to 0 if a trial could begin
+    N_ABOVE_LIMIT,
     N_SCALARS,
 ) = range(19)
 
@@ -133,7 +133,7 @@ def switching_options(
     `limit`, `estimates`, `matrix_cost` and `ratio` are the values of LIMIT, N_ESTIMATES, MATRIX_COST and COST_RATIO.
     `rules` has a row for each method: parameters of step-size control and w.reuse. `first`, `second`: their options.
     """
-    first = np.asarray(first)  # its entries are numbers, or expressions recorded for parameters of the system
+    first = np.asarray(first)  # numbers or, for code that is compiled for all parameters, expressions of parameters
     scalars = [limit, float(estimates), matrix_cost, ratio, float(first.size)]
     return np.concatenate([scalars, np.asarray(rules, dtype=np.float64).ravel(), first, np.asarray(second)])
 
@@ -167,8 +167,8 @@ def _method_memories(memory, n):
 def _power_iteration(f, w, t, state, direction, by_v, Q, V, A):
     """Take one power iteration: multiply `direction` (n_q) by dF/dq or, if `by_v` is True, by dF/dv (F: accelerations).
 
-    Only components of independent coordinates are used. Divide the product by its largest |component|, and return this
-    growth, an estimate of the largest eigenvalue. If F cannot be evaluated, return 0. (Q, V, A) is scratch.
+    Only components of independent coordinates are used. Scale the product to a largest |component| of 1. Return its
+    growth, an estimate of the largest eigenvalue; 0 if F cannot be evaluated. (Q, V, A) is scratch.
     """
     n = Q.size
     q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]
@@ -202,7 +202,7 @@ def _largest_rate(f, w, memory, t, state, new_state):
     by_q, by_v = memory[N_SCALARS : N_SCALARS + n], memory[N_SCALARS + n : N_SCALARS + 2 * n]
     Q, V, A = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n]
     growth_by_q = growth_by_v = 0.0
-    # generated code does not use the partition: it may be old, and its independent coordinates may hardly move
+    # generated code does not use the partition: an old one may have independent coordinates that hardly move
     is_explicit = memory[PHASE] == EXPLICIT
     if is_explicit and f.is_generated == 1 and renew_partition(f, w, t, state[:n]) != DONE:
         return 0.0
@@ -212,7 +212,7 @@ def _largest_rate(f, w, memory, t, state, new_state):
         growth_by_v = _power_iteration(f, w, t, state, by_v, True, Q, V, A)
         if growth_by_v * memory[H_MEAN] < NEGLIGIBLE_DAMPING:
             break
-    for m in range(n):  # a zero component could remain zero in later estimates, and hide its motion from them
+    for m in range(n):  # a zero component could stay zero, and the motion of its coordinate would not be seen later
         if by_q[m] == 0.0:
             by_q[m] = ZERO_REPLACEMENT
         if by_v[m] == 0.0:
@@ -222,9 +222,9 @@ def _largest_rate(f, w, memory, t, state, new_state):
 
 @compiled
 def _motion_rate(f, w, t, state, rate, Q, V, A):
-    """Return the rate (1/s) of the motion, the larger of max|a| / max|v| and max|da/dt| / max|a|; inf: unknown.
+    """Return the rate (1/s) at which the motion changes: the larger of max|a| / max|v| and max|da/dt| / max|a|.
 
-    `rate`, the largest rate rho, determines the time step of the finite difference for da/dt. (Q, V, A) is scratch.
+    Return inf if it is unknown. `rate`: largest rate rho, which sets the time step for da/dt. (Q, V, A): scratch.
     """
     n = Q.size
     dt = DIFFERENCE_STEP / rate
@@ -259,7 +259,7 @@ def _has_small_vibrations(w, tolerances, state, rate):
 
 @compiled
 def _cost_of_run(w, options):
-    """Return the cost of the run so far, in evaluations; a Jacobian counts as options[MATRIX_COST] evaluations."""
+    """Return the cost of the run so far, in evaluations of the equations; a Jacobian counts as options[MATRIX_COST]."""
     return w.n_evaluations + options[MATRIX_COST] * w.n_jacobians
 
 
@@ -287,7 +287,7 @@ def _begin_phase(w, options, memory, phase, t):
 
 @compiled
 def _judge_trial(w, options, memory, t):
-    """Return the phase that follows a trial, EXPLICIT or IMPLICIT, or -1 while the trial continues; t: present time."""
+    """Compare costs at the end of a trial; return the phase that follows, EXPLICIT or IMPLICIT; -1: it continues."""
     if memory[STEPS] == N_UNMEASURED_STEPS:
         memory[T_BEGIN], memory[COST_BEGIN] = t, _cost_of_run(w, options)
     if memory[STEPS] < N_UNMEASURED_STEPS + N_MEASURED_STEPS:
@@ -303,7 +303,7 @@ def _judge_trial(w, options, memory, t):
 
 @compiled
 def _phase_to_begin(f, w, options, memory, tolerances, t, state, new_state):
-    """Estimate the largest rate; if a trial of the other method must begin, return its phase (PHASE), else -1."""
+    """Estimate the largest rate; return the phase of a trial, ON_TRIAL or BACK_ON_TRIAL, if it must begin, else -1."""
     n = w.Q.size
     memory[RATE] = _largest_rate(f, w, memory, t, state, new_state)
     cost_per_second, cost = _cost_per_second(w, options, memory, t), _cost_of_run(w, options)
@@ -315,8 +315,8 @@ def _phase_to_begin(f, w, options, memory, tolerances, t, state, new_state):
         memory[N_ABOVE_LIMIT] += 1.0
     if memory[ESTIMATES_TO_WAIT] > 0.0:
         return -1
-    # unless `h_rho` exceeds STABILITY_LIMIT, a trial begins only if it is cheap compared with `counted`: the cost of
-    # the run so far or, if larger, a fraction of the expected cost of the whole run
+    # unless h_rho exceeds STABILITY_LIMIT, a trial begins only if it is cheap compared with `counted`: the cost of the
+    # run so far or, if larger, a fraction of the expected cost of the whole run
     counted, min_cost = cost, MIN_COST_IN_TRIALS * TRIAL_COST * options[COST_RATIO]
     if np.isfinite(tolerances[GAP]):
         counted = max(counted, COUNTED_FRACTION_OF_RUN * tolerances[GAP] / MAX_GAP_RATIO * cost_per_second)
@@ -338,7 +338,7 @@ def _phase_to_begin(f, w, options, memory, tolerances, t, state, new_state):
         or is_costly
         or (memory[N_ABOVE_LIMIT] >= options[N_ESTIMATES] and is_cheap)
     )
-    if is_cheap and h_rho <= 1.0:  # N_ABOVE_LIMIT is kept if trials cost too much: a trial begins later
+    if is_cheap and h_rho <= 1.0:  # if a trial is not cheap, N_ABOVE_LIMIT is kept, for a trial later
         memory[N_ABOVE_LIMIT] = 0.0
     is_expensive = cost_per_second > MIN_GAIN * memory[COST_PER_SECOND]  # the explicit method cost less
     if (memory[PHASE] == EXPLICIT and is_due) or (memory[PHASE] == IMPLICIT and (h_rho < RETURN_BELOW or is_expensive)):
@@ -350,7 +350,7 @@ def _phase_to_begin(f, w, options, memory, tolerances, t, state, new_state):
 
 @kernel(COMMIT)
 def commit_switching(f, w, options, memory, tolerances, accepted):
-    """Commit (if `accepted`) or discard the attempted step in the memory of the active method; count accepted steps."""
+    """Let the active method save (if `accepted`) or discard the data of its attempted step; count accepted steps."""
     first, second = _method_memories(memory, w.Q.size)
     begin = N_OPTIONS + int(options[SIZE_1])
     memory[MAY_ESTIMATE] = 0.0
@@ -367,9 +367,10 @@ def commit_switching(f, w, options, memory, tolerances, accepted):
 
 @kernel(ATTEMPT)
 def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """Attempt a step by the active method; first change this method if its rate estimate or a trial requires it.
+    """Attempt a step by the active method; but first begin or end a trial of the other method, if it is due.
 
-    The memory of a method is set to zero when this method becomes active. Each method has its own step-size control.
+    This is decided after accepted steps, and not for steps of fixed size. The memory of a method is set to zero when
+    it becomes active. Each method has its own parameters of step-size control.
     """
     n = w.Q.size
     first, second = _method_memories(memory, n)
@@ -395,14 +396,14 @@ def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
     w.reuse = max(rule[REUSE_OF], w.rounded)
     if is_explicit:
         code, error, factor = f.attempt_first(f, w, options[N_OPTIONS:begin], first, t, h, tolerances, state, new_state)
-        # a step of fixed size that does not converge cannot be shortened: use the implicit method now and later
+        # a step of fixed size that does not converge cannot be shortened: repeat it by the implicit method, now in use
         if code == OUTER_DIVERGED and tolerances[ESTIMATE] == 0.0 and f.form != FIXED_ORDER:
             _begin_phase(w, options, memory, IMPLICIT, t)
             second[:] = 0.0
             w.explicit_step = 0.0
             code, error, factor = f.attempt_second(f, w, options[begin:], second, t, h, tolerances, state, new_state)
     else:
-        # only the first method evaluates the equations within a step, so only its steps may exceed tolerances[GAP]
+        # only the first method evaluates the equations within its steps: only they may be longer than tolerances[GAP]
         ratio = gap_ratio(tolerances, h)
         if ratio > 0.0:
             return Attempt(DONE, ratio, 1.0 / ratio)
