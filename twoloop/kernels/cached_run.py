@@ -1,13 +1,12 @@
-"""Start a run and take its first steps in one compiled call, which stores all results in one array.
+"""Start a run and take its first steps in one compiled call, for runs with the same options as an earlier one.
 
-`start_and_advance` checks the start, takes steps with the independent rows and dependent coordinates of the previous
-run, and fills one array, `report`. Common arguments: `f`: kit; `w`: workspace; `b`: all other arrays, see RUN_ARRAYS.
+`start_and_advance` checks the start, takes steps with the setup of the earlier run, and stores all results in one
+array, which Python copies, and splits when a field of the result is read. Its parts are
 
     unused | report: N_REPORT numbers, counters | times | steps | states | unused
-                                                                ^ a fixed index
-`advance` writes the states, which begin at the fixed index. The number of steps, and so the length of the other parts,
-is known only afterwards: they are copied to the places before the fixed index. Python copies all used parts as one
-slice, and splits this slice when a field of the result is read.
+
+`advance` writes the states, which begin at a fixed index. The lengths of the other parts are known only afterwards:
+they are copied to the places before this index. Common arguments: `f`: kit; `w`: workspace; `b`: RUN_ARRAYS.
 """
 
 import math
@@ -36,15 +35,16 @@ from twoloop.kernels.data.indices import DEFECT_GAP, GAP, MAX_GAP_RATIO, N_COUNT
 from twoloop.kernels.evaluation.checks import CONSISTENT, DEFINITE, INDEFINITE, WELL_FORMED
 from twoloop.kernels.linalg.dense import copy
 
-ROUNDING = 1e-15  # corrections of positions below this, relative to the largest coordinate, count as rounding errors
+ROUNDING = 1e-15  # rounding error of a position, relative to its largest coordinate: smaller corrections do not count
 
 
 @merged
 def prepare_work(w, numbers, integers, pattern, q, accuracy, reuse):
     """Reset the workspace `w` in place before a run that starts at the position q (n_q).
 
-    `numbers`, `integers`: arrays of `w` that keep data from step to step; set to zero here. `pattern`: new w.pattern.
-    `accuracy`: new w.gamma_required. `reuse`: new w.reuse, if this is above the rounding error of q (data/indices.py).
+    `numbers`, `integers`: arrays of `w` that keep data from step to step; set to zero here. `pattern`: 1 for entries of
+    [C_q; A] that may be nonzero, else 0. `accuracy`: allowed relative error of gamma by finite differences. `reuse`:
+    after a correction of positions of at most this size, the inner loop does not evaluate C_q again.
     """
     for k in range(numbers.size):
         numbers[k] = 0.0
@@ -66,22 +66,24 @@ def prepare_work(w, numbers, integers, pattern, q, accuracy, reuse):
 
 @kernel(types.void(WORK, VECTOR, INTEGERS, MATRIX, VECTOR, f8, f8))
 def prepare_workspace(w, numbers, integers, pattern, q, accuracy, reuse):
-    """Call `prepare_work` for Python, which cannot call functions that are merged into their callers."""
+    """Call `prepare_work`, which Python cannot call because it is compiled into its callers only."""
     prepare_work(w, numbers, integers, pattern, q, accuracy, reuse)
 
 
 FIRST_STEP = 0.01  # first step size, relative to the shortest time scale of the initial motion, see _first_step_size
 MIN_FIRST_STEP = 1e4  # smallest first step size, in spacings of floating-point numbers at the start time
 SHORTEST_STEP = 1e-16  # a run fails if a step would be shorter than this fraction of the first step
-GAP_RATIO = 10  # tolerances[GAP] / tolerances[DEFECT_GAP] if forces may change suddenly with position or velocity
+# if forces may change suddenly with q or v, steps that check their defect evaluate the equations this number of times
+# as often: DEFECT_GAP, the time (s) allowed between two evaluations, is this number of times shorter than GAP
+GAP_RATIO = 10
 
 
 @exact
 def _first_step_size(state, n, t, span, smallest):
-    """Return the first step size (s): FIRST_STEP times the shortest time scale of the motion that starts from `state`.
+    """Return the first step size (s): FIRST_STEP times the shortest time scale of the motion from `state` [q, v, a].
 
-    The time scales are the duration `span` (s) of the run, and the times in which q changes by max|q|, and v by max|v|.
-    `smallest` replaces max|q| if it is larger. The size is at least MIN_FIRST_STEP floating-point spacings at t.
+    The time scales are the duration `span` (s) of the run, and the times in which q changes by max|q| or, if this is
+    larger, by `smallest`; and v by max|v|. The size is at least MIN_FIRST_STEP floating-point spacings at t.
     """
     distance, speed, acceleration = smallest, 0.0, 0.0
     for j in range(n):
@@ -92,7 +94,7 @@ def _first_step_size(state, n, t, span, smallest):
         time_scale = min(time_scale, distance / speed)
     if acceleration > 0.0:
         time_scale = min(time_scale, math.sqrt(distance / acceleration))
-    # omit the time in which v changes by max|v| if it is very short: the mechanism starts almost at rest
+    # the time in which v changes by max|v| does not count if it is very short: the mechanism starts almost at rest
     if speed > 0.0 and acceleration > 0.0 and speed / acceleration > FIRST_STEP * time_scale:
         time_scale = min(time_scale, speed / acceleration)
     return max(FIRST_STEP * time_scale, MIN_FIRST_STEP * np.spacing(abs(t)))
@@ -100,10 +102,10 @@ def _first_step_size(state, n, t, span, smallest):
 
 @exact
 def _set_step_limits(control, tolerances, span, longest, within):
-    """Limit the time between two evaluations of the equations to MAX_GAP_RATIO times `span`, the run's duration (s).
+    """Store limits of step sizes and of samples, so that forces are evaluated at least every MAX_GAP_RATIO * span (s).
 
-    The limits are GAP and DEFECT_GAP in `tolerances`, and MAX_STEP, TIME_SPACING and SPACING in `control`. If a method
-    evaluates the equations within steps (`within`), the step size is limited only by `longest` (s).
+    `span`: duration of the run (s). If the method adds evaluations within steps (`within`), the step size is limited
+    only by `longest` (s).
     """
     max_gap = MAX_GAP_RATIO * span
     tolerances[GAP], tolerances[DEFECT_GAP] = max_gap, max_gap / (GAP_RATIO if control[at.BY_STATE] > 0.0 else 1.0)
@@ -114,7 +116,7 @@ def _set_step_limits(control, tolerances, span, longest, within):
 
 @kernel(f8(VECTOR, VECTOR, VECTOR, i8, f8, f8, f8, f8, types.boolean))
 def first_step_and_limits(control, tolerances, state, n, t, t1, smallest, longest, within):
-    """Return the first step size (s), see `_first_step_size`; if `longest` (max_step) > 0, also `_set_step_limits`."""
+    """Call `_set_step_limits` if `longest` (s) is above 0; return the result of `_first_step_size` (s)."""
     if longest > 0.0:
         _set_step_limits(control, tolerances, t1 - t, longest, within)
     return _first_step_size(state, n, t, t1 - t, smallest)
@@ -137,10 +139,10 @@ def split_steps(steps, counts, h, changes, used_newton):
     """Split the records of steps, `steps` (rows of out_steps, see loop_state.py), into three arrays.
 
     - h: step sizes (s)
-    - changes: numbers of rejections by the error test, failures, and new partitions in each step
+    - changes: rows: numbers of rejections by the error test, of failures, and of new partitions before each step
     - used_newton: True for a step by Newton's method
 
-    `counts`: these three numbers since the start of the run; on entry before the first step, on return after the last.
+    `counts`: the same three numbers, since the start of the run: before the first step; on return, after the last.
     """
     for k in range(h.size):
         h[k], used_newton[k] = steps[k, at.H], steps[k, at.JACOBIANS] > 0.0
@@ -149,19 +151,17 @@ def split_steps(steps, counts, h, changes, used_newton):
             changes[i, k], counts[i] = count - counts[i], count
 
 
-# codes that `start_and_advance` returns in place of a number of steps
-# - REFUSED: no steps were taken; Python must set up the run anew, or report what is wrong with the start
-# - IN_DOUBT: no steps were taken, because the start may violate the constraints; Python must check it
-# - UNUSUAL: steps were taken, but Python must read the report, and may have to continue the run
-# - UNCHOSEN: no steps were taken, because Python must check whether the generated code suits this start
-REFUSED, IN_DOUBT, UNUSUAL, UNCHOSEN = -1, -2, -3, -4
-# values of `checks`, what Python has checked about a start: nothing; that it satisfies the constraints; in addition,
-# that the generated code suits it
+REFUSED = -1  # returned code: no steps were taken; Python must set up the run anew, or report an error of the start
+IN_DOUBT = -2  # returned code: no steps were taken; Python must check whether the start satisfies the constraints
+UNUSUAL = -3  # returned code: steps were taken, but Python must read the report, and may have to continue the run
+UNCHOSEN = -4  # returned code: no steps were taken; Python must check whether the generated code suits the start
+# values of `checks`: Python has checked nothing; that the start satisfies the constraints; also that the generated code
+# suits it
 NOTHING_CHECKED, STATE_CHECKED, CHOICES_CHECKED = 0, 1, 2
 
-# arrays for the checks of a start, for the choice of rows and for steps; successive runs reuse them. Among them are
-# - `numbers`: array whose parts are clock, control and tolerances; `start_numbers`: values of `numbers` at a start
-# - `start_memory`: values at a start of the method's `memory`, at the indices `memory_places`; its other entries are 0
+# arrays of a run, which later runs with the same options reuse. Among them are
+# - `numbers`: one array with the parts clock, control, tolerances; `start_numbers`: what it contains before a run
+# - `start_memory`: numbers that the method's `memory` contains before a run, at the indices `memory_places`
 # - `last_start`: t, t1, q and v of the last start; `start_rows`: indices of the independent constraint rows there
 # - `saved`, `saved_integers`: all data computed at a start; if more runs begin at this start, they restore these data
 RUN_ARRAYS = Reference(
@@ -185,34 +185,40 @@ RUN_ARRAYS.add_function("choose", i8(MATRIX, MATRIX, f8, f8, VECTOR, VECTOR, INT
 RUN_ARRAYS.add_function("dependents", i8(MATRIX, INTEGERS, INTEGERS, i8, VECTOR, INTEGERS, INTEGERS))
 RUN_ARRAYS.add_function("start", i8(KIT, WORK, f8, VECTOR))
 RUN_ARRAYS.add_function("advance", i8(KIT, WORK, *(VECTOR,) * 9, MATRIX, MATRIX, INTEGERS))
-# indices in `constants`, settings of a run; G: the constraint rows, C_q and then A of non-holonomic constraints
-# - ACCURACY, REUSE, NEARLY_SINGULAR, EQUATION_FORM: initial w.gamma_required, w.reuse, w.nearly_singular and f.form
-# - HAS_ALL_ENTRIES: 1 if the array `kinds` shows all entries of G that may be nonzero
-# - RANK_LIMIT: a row of G with a smaller relative pivot counts as dependent on other rows
-# - WEAK_LIMIT: M counts as singular if the ratio of its smallest to its largest eigenvalue is below this
-# - ADDED_SCALE: if M is singular, generated code replaces it by M + s g^T g with some rows g of G and this factor s
-# - CONTRADICTS: if the residual of a redundant row, relative to its terms, exceeds this, the start is refused
-# - MASS_FLAG: DEFINITE or INDEFINITE, whichever M must be at the start; 0: M is constant, and not checked
-# - LEAST_PIVOT: if the smallest pivot of G at the start is below this, the start is refused
-# - NEAR_PIVOT: Python must check a run whose smallest pivot of G at an output time is below this
-# - FIRST_SIZE: first step size (s) that the user has chosen, or 0; LEAST_DISTANCE: `smallest` of _first_step_size
-# - LONGEST, EVALUATES_WITHIN: `longest` and `within` of _set_step_limits
-# - MAX_CHANGE_RATIO: velocities jump in a step if they change by more than this times the step size times |a|
-# - MIN_SAMPLES: Python must check a run in which a force, C_t or b changes twice within this number of sample spacings
-ACCURACY, REUSE, NEARLY_SINGULAR, HAS_ALL_ENTRIES, RANK_LIMIT, WEAK_LIMIT, ADDED_SCALE, CONTRADICTS = range(8)
-MASS_FLAG, LEAST_PIVOT, EQUATION_FORM, FIRST_SIZE, LEAST_DISTANCE, LONGEST, EVALUATES_WITHIN = range(8, 15)
-NEAR_PIVOT, MAX_CHANGE_RATIO, MIN_SAMPLES = range(15, 18)
+# indices in `constants`, the settings of runs; G are the constraint rows [C_q; A]
+(
+    ACCURACY,  # allowed relative error of gamma by finite differences: initial w.gamma_required
+    REUSE,  # after a smaller correction of positions, the inner loop keeps C_q: initial w.reuse
+    NEARLY_SINGULAR,  # initial w.nearly_singular: 1 if the method does not check within steps for singular positions
+    HAS_ALL_ENTRIES,  # 1: the array `kinds` shows all entries of G that may be nonzero; 0: search for them at the start
+    RANK_LIMIT,  # a row of G with a smaller relative pivot counts as dependent on other rows
+    WEAK_LIMIT,  # M counts as singular if the ratio of its smallest to its largest eigenvalue is below this
+    ADDED_SCALE,  # factor s: for a singular M, generated code uses M + s g^T g instead, where g are some rows of G
+    CONTRADICTS,  # a start is refused if a row of G a = gamma has a larger residual, relative to the sum of |terms|
+    MASS_FLAG,  # DEFINITE or INDEFINITE: a start is refused if M is not so; 0: M is constant, and not checked
+    LEAST_PIVOT,  # a start is refused if the smallest pivot of C_q there is below this
+    EQUATION_FORM,  # initial f.form, the algebra that solves for accelerations
+    FIRST_SIZE,  # first step size (s) that the user has chosen; 0: it is computed
+    LEAST_DISTANCE,  # argument `smallest` of _first_step_size
+    LONGEST,  # longest step (s): argument `longest` of _set_step_limits
+    EVALUATES_WITHIN,  # 1: the method adds evaluations within long steps; 0: long steps are forbidden
+    NEAR_PIVOT,  # Python must check a run if, at an output time, (smallest / largest pivot of C_q) is below this
+    MAX_CHANGE_RATIO,  # velocities jump in a step if they change by more than this times (step size) times |a|
+    MIN_SAMPLES,  # Python must check a run if a force, C_t or b changes suddenly twice in this many sample spacings
+) = range(18)
 # indices in `expected`, the choice of constraint rows for which code was generated (empty without generated code)
-# - BOUND: the result that `choose` must return for this choice; OF_PYTHON: only Python can make the choice
-# - N_ROWS, N_ADDED: number of independent rows, and number of rows added to a singular M
-# - FIRST_ROW: index of the first entry of two lists, one after the other: the independent rows, and the added rows
-BOUND, N_ROWS, N_ADDED, FIRST_ROW = range(4)
+(
+    BOUND,  # result that `choose` returns for this choice; OF_PYTHON: only Python can make the choice
+    N_ROWS,  # number of independent rows
+    N_ADDED,  # number of rows g that are added to a singular M as s g^T g
+    FIRST_ROW,  # begin of two lists, one after the other: indices of the independent rows, and of the added rows
+) = range(4)
 OF_PYTHON = 100
 
 
 @merged
 def _has_choices_of_code(b):
-    """Choose independent rows and dependent coordinates; return True if the code was generated for these choices."""
+    """Choose independent rows and dependent coordinates anew; return True if the code was generated for this choice."""
     b.scratch[0] = 0.0
     limits = b.constants[RANK_LIMIT], b.constants[WEAK_LIMIT]
     first_bound = b.choose(b.mass, b.rows, *limits, b.bounds, b.scratch, b.chosen)
@@ -238,7 +244,7 @@ def _has_choices_of_code(b):
 
 @merged
 def _has_consistent_rows(w, b, n):
-    """Return True if the accelerations a in b.state satisfy all rows of G a = Gamma, also the redundant ones."""
+    """Return True if the accelerations a in b.state satisfy all rows of G a = gamma, also the redundant ones."""
     if w.rows_v.size == len(b.rows):
         return True
     for i in range(len(b.rows)):
@@ -253,10 +259,10 @@ def _has_consistent_rows(w, b, n):
 
 @merged
 def _start_run(f, checked_kit, w, b, t, t1, q, v, records, checks):
-    """Prepare a run from t to t1 with the setup of the last run; return 0, or REFUSED, IN_DOUBT or UNCHOSEN.
+    """Check the start of a run from t to t1, and prepare the run; return 0, or REFUSED, IN_DOUBT or UNCHOSEN.
 
-    `checked_kit`: kit whose callbacks check the start; `checks`: what Python has already checked, for example
-    STATE_CHECKED; `records`: sizes and nonzero entries at earlier positions, see `evaluate_start`.
+    `checked_kit`: kit with the callbacks of the user, which check the start (`f` may also have derived ones); `checks`:
+    what Python has checked, such as STATE_CHECKED; `records`: data of earlier positions, see `evaluate_start`.
     """
     n = q.size
     if not (finite_vector(q) and finite_vector(v)):
@@ -270,7 +276,7 @@ def _start_run(f, checked_kit, w, b, t, t1, q, v, records, checks):
     )
     if has_all_entries:
         pattern = b.pattern.reshape(b.pattern.size)
-        for k in range(b.kinds.size):  # kind 0: the entry of the constraint rows is always zero
+        for k in range(b.kinds.size):  # for each entry of [C_q; A]: kind 0 if it is always zero
             pattern[k] = 1.0 if b.kinds[k] != 0 else pattern[k]
     if flags & WELL_FORMED == 0 or flags & (DEFINITE | INDEFINITE) != int(b.constants[MASS_FLAG]):
         return REFUSED
@@ -321,15 +327,14 @@ def _restore_start(b):
     copy(b.saved_integers, b.lasting_integers)
 
 
-# indices in `last_start`. N_EQUAL: number of successive runs from the last start, at most 2. START: index of the first
-# number of the last start, [t, t1, q, v]
-N_EQUAL, START = 0, 1
-NEVER, IS_SAVED = 0.0, 2.0  # values of N_EQUAL: no run could begin at the last start; `saved` has data of this start
+N_EQUAL = 0  # index in `last_start` of the number of successive runs from the last start, at most 2
+START = 1  # index in `last_start` at which the last start, [t, t1, q, v], begins
+NEVER, IS_SAVED = 0.0, 2.0  # values of last_start[N_EQUAL]: no run could begin there; its data have been saved
 
 
 @exact
 def _equals_last_start(last_start, t, t1, q, v):
-    """Return True if the start (t, t1, q, v) equals the last one bit for bit; store it in `last_start`."""
+    """Return True if the start (t, t1, q, v) equals the last one bit for bit; store it as the last one."""
     n, is_same = q.size, last_start[N_EQUAL] > NEVER
     for k in range(2 + 2 * n):
         x = t if k == 0 else t1 if k == 1 else q[k - 2] if k < 2 + n else v[k - 2 - n]
@@ -339,21 +344,26 @@ def _equals_last_start(last_start, t, t1, q, v):
     return is_same
 
 
-# indices in the report of a run; flags are 1 (true) or 0. N_REPORT: index of the first counter
-# - N_STATES: number of states, including the first; N_STEPS: number of steps
-# - NOTHING_TO_CHECK: flag, Python need not check this run; IS_NEW: flag, the start differs from the previous one
-# - JUMPED: flag, velocities jumped in the last step (see MAX_CHANGE_RATIO); END_CODE: code that `advance` returned
-# - IN_CHECKED_REGION: flag, all states are in the region in which callbacks agreed with their traces
-# - DEFECT_KNOWN: flag, the defect was evaluated in every step; DEFECT: largest defect / its tolerance
-# - LONGEST_GAP: longest time (s) between two evaluations of the equations
-N_STATES, N_STEPS, NOTHING_TO_CHECK, JUMPED, IN_CHECKED_REGION, DEFECT_KNOWN = range(6)
-DEFECT, LONGEST_GAP, END_CODE, IS_NEW, N_REPORT = range(6, 11)
-N_HEAD = N_REPORT + N_COUNTERS  # length of the report without times and steps
+# indices in the report of a run
+(
+    N_STATES,  # number of states, including the first
+    N_STEPS,  # number of steps
+    NOTHING_TO_CHECK,  # 1: no jump of velocities, no singular position near, no changes too fast for samples; else 0
+    JUMPED,  # 1: velocities jumped in the last step (see MAX_CHANGE_RATIO); else 0
+    IN_CHECKED_REGION,  # 1: all states are in the region in which callbacks agreed with their traces; else 0
+    DEFECT_KNOWN,  # 1: the defect (of accelerations) was evaluated in every step; else 0
+    DEFECT,  # largest defect, divided by its tolerance
+    LONGEST_GAP,  # longest time (s) between two evaluations of the equations
+    END_CODE,  # code that `advance` returned
+    IS_NEW,  # 1: the start differs from that of the previous run; 0: it is the same
+    N_REPORT,  # index of the first counter (of steps, rejections, evaluations, ...)
+) = range(11)
+N_HEAD = N_REPORT + N_COUNTERS  # length of the report with counters, without times and steps
 
 
 @merged
 def _has_velocity_jump(b, k, n):
-    """Return True if velocities jump between states k - 1 and k, see MAX_CHANGE_RATIO; n: number of coordinates."""
+    """Return True if velocities jump between states k - 1 and k of n coordinates, see MAX_CHANGE_RATIO."""
     change, first, last = 0.0, 0.0, 0.0
     for j in range(n):
         change = max(change, abs(b.states[k, n + j] - b.states[k - 1, n + j]))
@@ -365,8 +375,8 @@ def _has_velocity_jump(b, k, n):
 def _write_report(w, b, region, n_rows, n_steps, code, is_new):
     """Store the report, times and steps of a run in b.report; return n_steps, or UNUSUAL if Python must read b.report.
 
-    n_rows: number of states after the first. code: end code of `advance`. is_new: value of IS_NEW. region: two rows,
-    the least and the greatest [t, q, v] at which callbacks were checked.
+    `n_rows`: number of states after the first. `code`: end code of `advance`. `is_new`: value of IS_NEW. `region`: two
+    rows, the least and the greatest [t, q, v] at which callbacks were checked.
     """
     has_jumped = n_rows > 0 and _has_velocity_jump(b, n_rows, w.Q.size)
     is_inside = region.shape[1] > 0 and _is_within_bounds(b.t[: 1 + n_rows], b.states, region)
@@ -393,8 +403,8 @@ def _write_report(w, b, region, n_rows, n_steps, code, is_new):
 def start_and_advance(f, checked_kit, w, b, t, t1, q, v, records, region, checks):
     """Start a run from t to t1, and take the first steps; return the number of steps, or a code such as REFUSED.
 
-    If successive runs begin at the same start, the second one checks it again, and saves all data computed there. Later
-    runs restore these data without a check. For the arguments see _start_run and _write_report.
+    If successive runs begin at the same start, the second one saves all data computed there, and later ones restore
+    these data without a check. For the arguments see _start_run and _write_report.
     """
     f.form = int(b.constants[EQUATION_FORM])  # the previous run may have changed the form of the linear equations
     is_repeated, n_equal = _equals_last_start(b.last_start, t, t1, q, v), b.last_start[N_EQUAL]

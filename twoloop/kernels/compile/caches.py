@@ -4,10 +4,9 @@ Numba's own cache has three shortcomings. It recompiles a function when the file
 globals change, whose values are part of the machine code, nor when called functions in other files change. It raises an
 error if no folder can be written, or if a file is damaged. And it runs code that other users have put into its folder.
 
-Here each function and key has its own file with a checksum. Code is loaded only from files and folders that belong to
-the user or root, and that no other user can write; SSH requires the same of its key files. The reason: whoever can
-write or replace a file of machine code can run any code in the name of the user who loads the file. A checksum does not
-prevent this, because the attacker can write the checksum, too.
+Here each function and key (such as a signature) has its own file with a checksum. Code is loaded only from files and
+folders that belong to the user or root, and that no other user can write: whoever can write a file of machine code can
+run any code in the name of the user who loads it. A checksum does not prevent this, as the attacker can write it, too.
 """
 
 import gc
@@ -50,9 +49,9 @@ class UntrustedFile(OSError):
 
 
 def read_trusted(path: Path) -> bytes:
-    """Return the content of a file; the folder must be one that `trusted_folder` has returned.
+    """Return the content of a file in a folder that `trusted_folder` has returned; raise OSError if there is none.
 
-    Raise OSError if there is no such file. Warn and raise UntrustedFile if another user could have written the file.
+    If another user could have written the file, print a warning and raise UntrustedFile.
     """
     with path.open("rb") as file:
         if reason := _reason_of_mode(os.fstat(file.fileno())):
@@ -62,7 +61,7 @@ def read_trusted(path: Path) -> bytes:
 
 
 def replace_trusted(path: Path, content: bytes) -> None:
-    """Replace the file `path` atomically by a new one with `content`, which only the user can write (any umask)."""
+    """Write a new file, which only the user can write, and let it replace the file `path` in one operation."""
     make_trusted_folder(path.parent)
     unfinished = path.with_suffix(f".{uuid.uuid4().hex}")
     try:
@@ -74,7 +73,7 @@ def replace_trusted(path: Path, content: bytes) -> None:
 
 
 def make_trusted_folder(folder: Path) -> None:
-    """Create a folder and the missing folders above it, which only the user can write, whatever the umask."""
+    """Create a folder, and missing folders above it, that only the user can write."""
     for each in [*reversed(folder.parents), folder]:
         if not each.exists():
             each.mkdir(0o755, exist_ok=True)
@@ -98,8 +97,8 @@ def trusted_folder(folder: Path) -> Path:
 
 
 def reason_to_distrust(folder: Path) -> str:
-    """Return the reason why another user could have written to a folder or a folder above it; "" if nobody could."""
-    if os.name != "posix":  # then the mode does not contain the access rights
+    """Return why another user may be able to write to a folder or a folder above it; "" if nobody is."""
+    if os.name != "posix":  # on Windows, the mode does not contain the access rights
         return ""
     real_path = Path(os.path.realpath(folder))
     for each in [real_path, *real_path.parents]:
@@ -109,7 +108,7 @@ def reason_to_distrust(folder: Path) -> str:
             continue
         except OSError as error:
             return f"{each} cannot be examined ({error.strerror})"
-        # all users may write to a sticky folder, such as /tmp, but each entry can be replaced by its owner only
+        # all users may write to a sticky folder above it, such as /tmp, but only the owner can replace an entry
         is_sticky = each != real_path and status.st_mode & stat.S_ISVTX
         reason = _reason_of_owner(status) if is_sticky else _reason_of_mode(status)
         if reason:
@@ -118,7 +117,7 @@ def reason_to_distrust(folder: Path) -> str:
 
 
 def _reason_of_mode(status: os.stat_result) -> str:
-    """Return the reason why another user can write a file or folder with this status; "" if no other user can."""
+    """Return why another user can write a file or folder, given its status; "" if no other user can."""
     if os.name != "posix":
         return ""
     if reason := _reason_of_owner(status):
@@ -137,7 +136,7 @@ def _reason_of_owner(status: os.stat_result) -> str:
 
 @cache
 def _is_private_group(gid: int) -> bool:
-    """Return True if a group is root's or the user's own, and only root and the user are members."""
+    """Return True if only root and the user are members of a group, which is root's or the user's own."""
     import grp  # not available on Windows
     import pwd
 
@@ -151,7 +150,7 @@ def _is_private_group(gid: int) -> bool:
 
 @cache
 def _temporary_folder() -> tempfile.TemporaryDirectory[str]:
-    """Return the temporary folder of this process, which is created at the first call."""
+    """Create a temporary folder at the first call; return it at every call. It is removed when the process ends."""
     return tempfile.TemporaryDirectory(prefix="twoloop-")
 
 
@@ -159,21 +158,21 @@ _warnings: list[str] = []  # the warning that `_warn_first` has printed; empty i
 
 
 def _warn_first(text: str) -> None:
-    """Print a warning about files of other users on stderr, unless this process has printed one before."""
+    """Print a warning about files of other users on stderr, but only the first one in this process."""
     if not _warnings:
         _warnings.append(text)
         print(text, file=sys.stderr, flush=True)
 
 
-MAX_ON_DISK = 500  # largest number of files on disk for each kind of generated functions; the oldest are removed
+MAX_ON_DISK = 500  # a CodeFiles object with `is_limited` keeps at most this many files; it removes the oldest
 CHECKSUM_SIZE = hashlib.sha256().digest_size  # length (bytes) of the checksum at the beginning of a file
 
 
 class CodeFiles:
-    """Store the machine code of a function on disk, in one file with a checksum for each key.
+    """Store the machine code of a function on disk, in one file with a checksum for each key, such as a signature.
 
-    Only the user can write these files. A file that is damaged or out of date (another `stamp` or version of numba)
-    counts as missing. There is no index of the files: two processes may spoil that of numba's own cache.
+    Only the user can write these files. A file counts as missing if it is damaged or out of date: written with another
+    `stamp` or version of numba. There is no index file, which several processes may spoil, as that of numba's cache.
     """
 
     def __init__(self, folder: Path, name: str, stamp: Any, is_limited: bool = False):
@@ -181,7 +180,7 @@ class CodeFiles:
         self.origin = numba.__version__, stamp
 
     def save(self, key: Any, data: Any) -> None:
-        """Write the data for a key to its file, which replaces the previous file for this key."""
+        """Write the data for a key to a file, which replaces the previous file for this key."""
         content = pickle.dumps((repr((*self.origin, key)), dumps(data)))
         replace_trusted(self._path_for_key(key), hashlib.sha256(content).digest() + content)
         if self.is_limited:
@@ -189,7 +188,7 @@ class CodeFiles:
                 old.unlink(missing_ok=True)
 
     def has_file(self, key: Any) -> bool:
-        """Return True if there is a file for a key; the file may be damaged or out of date."""
+        """Return True if there is a file for a key, even if it is damaged or out of date."""
         return self._path_for_key(key).exists()
 
     def load(self, key: Any) -> Any:
@@ -227,7 +226,7 @@ UNWRITABLE_CACHE_WARNING = (
     "twoloop: machine code cannot be kept on disk, so every process compiles again. Set NUMBA_CACHE_DIR to a folder "
     "that only you can write"
 )
-MAX_IN_MEMORY = 50  # largest number of entries of a BoundedCache, in memory
+MAX_IN_MEMORY = 50  # largest number of entries of a BoundedCache
 # numba's class that chooses subfolders of the folder NUMBA_CACHE_DIR; its name is private in numba 0.61
 _LOCATOR: Any = vars(caching).get("UserProvidedCacheLocator") or vars(caching)["_UserProvidedCacheLocator"]
 
@@ -242,10 +241,10 @@ def compile_cached(
 ) -> Dispatcher:
     """Compile a function for one signature, or read its machine code from the disk; return numba's dispatcher.
 
-    digests : two digests of everything on which the machine code depends, see `digests_of`. If the first digest differs
-        from that of a file, the file is out of date. The second one, of closure variables, is part of the name of the
-        file: functions with the same source may differ in these. None: no machine code is stored on disk.
-    announcement : text printed on stderr before the first compilation of this process.
+    digests : two digests of everything on which the machine code depends, see `digests_of`. A file with another first
+        digest is out of date. The second one, of closure variables, is part of the name of the file, because functions
+        with the same source may have different closure variables. None: no machine code is stored on disk.
+    announcement : text to print on stderr if the function must be compiled; each text is printed once in a process.
     **options : options of numba.njit.
     """
     dispatcher = njit(**options)(give_unique_name(function, digests))
@@ -253,7 +252,7 @@ def compile_cached(
     if digests is not None:
         try:
             dispatcher._cache = _CodeCache(function, *digests, announcement)
-        except RuntimeError:  # there is no folder for machine code, for example of a function typed at a prompt
+        except RuntimeError:  # no folder can be written, or the function has no file, as it was typed at a prompt
             if Path(inspect.getfile(function)).exists():
                 warn_once(UNWRITABLE_CACHE_WARNING)
     with garbage_collection_off():
@@ -265,7 +264,7 @@ def compile_cached(
 
 @contextmanager
 def garbage_collection_off() -> Iterator[None]:
-    """Return a context without garbage collection, which would take a sixth of the compile time, and free nothing."""
+    """Return a context without garbage collection, which takes a sixth of the compile time and frees nothing."""
     was_enabled = gc.isenabled()
     gc.disable()
     try:
@@ -288,12 +287,12 @@ _N_COMPILED = [0]  # number of calls of `compile_cached`
 
 
 def n_compiled() -> int:
-    """Return the number of functions that this process has compiled with numba or read from the disk."""
+    """Return the number of functions that `compile_cached` has compiled or read from the disk in this process."""
     return _N_COMPILED[0]
 
 
 def cache_folder(package: types.ModuleType) -> Path | None:
-    """Return the folder for cached machine code of a package, or None if no folder can be written."""
+    """Return the folder for machine code of the functions of a package, or None if no folder can be written."""
 
     def placeholder() -> None:
         pass
@@ -309,9 +308,8 @@ def cache_folder(package: types.ModuleType) -> Path | None:
 def give_unique_name(function: Callable[..., Any], digests: tuple[str, str] | None) -> Callable[..., Any]:
     """Return a copy of a nested function or lambda with a unique name; return any other function unchanged.
 
-    Numba makes the name of machine code from the qualified name of the function and the number of functions that the
-    process has compiled so far. So closures compiled by two processes may get the same name. A process that loads both
-    from the disk would then run the same code for both.
+    Numba names machine code by the function's qualified name and the number of functions compiled so far. So closures
+    compiled by two processes may get the same name, and a process that loads both would run one code for both.
     """
     if digests is None or "<" not in function.__qualname__:
         return function
@@ -326,11 +324,11 @@ def give_unique_name(function: Callable[..., Any], digests: tuple[str, str] | No
 
 
 class _CodeCache(FunctionCache):
-    """Numba's cache of a function, but with twoloop's digests and files. If a file is invalid, numba compiles again."""
+    """Numba's cache of a function, but with CodeFiles; `stamp` and `key` are the two digests of `compile_cached`."""
 
     def __init__(self, function: Callable[..., Any], stamp: str, key: str, announcement: str):
         cache_dir: str = numba.config.CACHE_DIR  # type: ignore[attr-defined]
-        if cache_dir:  # create the folder here: numba might let others write to it
+        if cache_dir:  # create the folder before numba does, which might let other users write to it
             with suppress(OSError):
                 make_trusted_folder(Path(cache_dir, _LOCATOR.get_suitable_cache_subpath(inspect.getfile(function))))
         super().__init__(function)
@@ -341,21 +339,21 @@ class _CodeCache(FunctionCache):
         self._key, self._announcement = key, announcement
 
     def _index_key(self, sig: Any, codegen: Any) -> Any:
-        """Return the key of the file for a signature: signature, processor, and digest of closure variables."""
+        """Return the key of the file for a signature; it includes the processor and the digest of closure variables."""
         return sig, codegen.magic_tuple(), self._key
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """Return the machine code for a signature, or None if it has to be compiled."""
         try:
             overload = super().load_overload(sig, target_context)
-        except Exception:  # an incompatible file from another installation; compilation will overwrite it
+        except Exception:  # the file is from an incompatible installation: numba compiles again and overwrites it
             overload = None
         if overload is None and self._announcement:
             warn_once(self._announcement)
         return overload
 
     def save_overload(self, sig: Any, data: Any) -> None:
-        """Store machine code on disk; warn if this is impossible."""
+        """Store machine code on disk; print a warning if this is impossible."""
         try:
             super().save_overload(sig, data)
         except OSError:
@@ -363,7 +361,7 @@ class _CodeCache(FunctionCache):
 
 
 def sources_folder() -> Path:
-    """Return the folder of generated code, in NUMBA_CACHE_DIR if this is set, otherwise in the user's cache folder.
+    """Return the folder of generated code: `equations` in NUMBA_CACHE_DIR, or else in the user's cache folder.
 
     If other users can write this folder, return a replacement, see `trusted_folder`.
     """
@@ -379,15 +377,15 @@ def warn_once(text: str) -> None:
 
 
 def compiled_when_called(**options: Any) -> Callable[[Callable[..., Any]], Dispatcher]:
-    """Return a decorator like numba.njit(**options), but with twoloop's cache on disk. The first call compiles."""
+    """Return a decorator like numba.njit(**options), but with twoloop's cache. The first call compiles the function."""
 
     def decorate(function: Callable[..., Any]) -> Dispatcher:
         digests = digests_of(function)
         dispatcher = njit(**options)(give_unique_name(function, digests))
         if digests is not None:
-            # if a callback calls this function, `_use_twoloop_cache` recompiles it only if its digests have changed
+            # for `_use_twoloop_cache`, which recompiles this function if a callback calls it and its digests differ
             _COMPILED_DIGESTS[dispatcher] = digests
-            with suppress(RuntimeError):  # no folder can be written
+            with suppress(RuntimeError):  # if no folder can be written, do not store machine code
                 dispatcher._cache = _CodeCache(dispatcher.py_func, *digests, "")
         return dispatcher
 
@@ -397,10 +395,10 @@ def compiled_when_called(**options: Any) -> Callable[[Callable[..., Any]], Dispa
 def digests_of(function: Callable[..., Any]) -> tuple[str, str] | None:
     """Return two digests of all values on which the machine code of a function depends; set up its helpers' caches.
 
-    The helpers are the compiled functions that the function calls: twoloop's cache replaces numba's cache of them. The
-    first digest is of the code, defaults and globals of the function, and of attributes of modules that it uses. The
-    second digest is of its closure variables. Both include the values that helpers use. If a value could change without
-    a change of the digests, return None.
+    Helpers are the compiled functions that the function calls; twoloop's cache replaces numba's cache of them. The
+    first digest covers code, defaults and globals of the function, and attributes of modules that it uses; the second
+    one its closure variables; both also cover the values that helpers use. Return None if a value could change without
+    a change of the digests.
     """
     digests, helpers = _digests_and_helpers(function)
     for each in helpers:
@@ -409,9 +407,9 @@ def digests_of(function: Callable[..., Any]) -> tuple[str, str] | None:
 
 
 def _digests_and_helpers(function: Callable[..., Any]) -> tuple[tuple[str, str] | None, list[Any]]:
-    """Return the digests of `digests_of`, and the helpers; a helper comes after the helpers that it calls."""
+    """Return the result of `digests_of`, and the helpers of a function; each comes after the helpers that it calls."""
     code, closure = Digest(), Digest()
-    closure.names = reachable_names(function)  # if a value is a module, attributes with these names are hashed
+    closure.names = reachable_names(function)  # for a value that is a module, attributes with these names count
     try:
         code.add_function(function, enclosed=False)
         closure.add(closure_values(function))
@@ -424,8 +422,8 @@ def _digests_and_helpers(function: Callable[..., Any]) -> tuple[tuple[str, str] 
 def helper(function: Callable[..., Any]) -> Any:
     """Compile a function that compiled callbacks call, like numba's `njit`, but with twoloop's cache.
 
-    The function must not allocate arrays. Then numba need not count references to arrays, which would take longer than
-    the computation of a row of C_q.
+    The function must not create arrays: references to arrays are not counted, as this would take longer than the
+    computation of a row of C_q.
     """
     options: dict[str, Any] = {"_nrt": False, "error_model": "numpy"}
     dispatcher = njit(**options)(function)
@@ -434,15 +432,15 @@ def helper(function: Callable[..., Any]) -> Any:
     return dispatcher
 
 
-# digests that helpers had when they were compiled
+# digests that functions called by callbacks had when they were compiled last
 _COMPILED_DIGESTS: WeakKeyDictionary[Any, tuple[str, str]] = WeakKeyDictionary()
 
 
 def _use_twoloop_cache(helper: Any) -> None:
     """Replace numba's cache of a helper by twoloop's cache, and recompile the helper if its digests have changed.
 
-    Numba's cache ignores changes of functions in other files that the helper calls, and numba may have loaded outdated
-    code from it. Without recompilation, callbacks compiled later would contain this code.
+    Numba's cache ignores changes of functions in other files that the helper calls. So numba may have loaded outdated
+    code, which callbacks compiled later would contain.
     """
     digests, compiled = _digests_and_helpers(getattr(helper, "py_func", helper))[0], _COMPILED_DIGESTS.get(helper)
     has_changed = compiled is not None and compiled != digests

@@ -1,7 +1,7 @@
-"""Define the kinds of callback that a mechanism may have, and the decorator that compiles a callback.
+"""Define the kinds of callback that a mechanism may have, such as "mass", and the decorator that compiles a callback.
 
-All kinds are defined in the table `KINDS`. Its entries determine the signature that numba compiles, the fields of
-`Functions` in the kernels, the methods and the documentation of `ConstrainedSystem`, and adapters for Python functions.
+The table `KINDS` determines the signature that numba compiles, the fields of `Functions` in the kernels, the methods
+and the documentation of `ConstrainedSystem`, and adapters for Python functions.
 
 If a callback computes an index, for example into a table, its machine code checks every index at every call. Without
 this check it might read memory beyond the end of an array, or crash the process. If all indices are constants or loop
@@ -34,15 +34,15 @@ from twoloop.kernels.compile.dependencies import (
 from twoloop.kernels.compile.linking import add_signature, options_of
 
 BOUNDS_CHECK = {"boundscheck": True}  # option of numba: machine code raises IndexError for an invalid index
-# built-in functions: if all arguments need no check as indices (constants, loop counters), nor does the result
+# built-in functions whose results need no check as indices if their arguments need none (constants, loop counters)
 SAFE_CALLS = ("len", "min", "max", "abs", "range", "enumerate", "zip", "reversed")
 
 
 def add_bounds_checks(function: Callable[..., Any]) -> tuple[Callable[..., Any], dict[str, Any]]:
-    """Return the function to compile in place of `function`, and options of numba that check indices if necessary.
+    """Return the function to compile in place of a callback, and the options of numba, for checks of its indices.
 
-    If a compiled helper of `function` computes indices, the returned function is a copy of `function`, which calls
-    copies of all its helpers; these copies check their indices.
+    The options are empty if no index is computed. If a compiled function that the callback calls (a helper) computes
+    indices, the returned function is a copy of the callback that calls copies of all helpers with checks.
     """
     helpers = [helper for place in frozen_locations(function) if (helper := python_function(place.value)) is not None]
     if any(map(has_computed_indices, helpers)):
@@ -51,28 +51,28 @@ def add_bounds_checks(function: Callable[..., Any]) -> tuple[Callable[..., Any],
 
 
 def _compile_with_bounds_checks(copy: Any, original: Any) -> Any:
-    """If `original` is a compiled helper, compile `copy` so that it checks its indices; otherwise, return `copy`."""
+    """Return `copy`, compiled with checks of its indices if `original`, from which it is made, is compiled."""
     helper = python_function(original)
     if helper is None:
         return copy
-    copy.__qualname__ = f"{helper.__qualname__}.watched"  # numba needs different names for different machine code
+    copy.__qualname__ = f"{helper.__qualname__}.watched"  # numba must not confuse it with the code without checks
     return jit(**{**options_of(original), **BOUNDS_CHECK})(give_unique_name(copy, digests_of(helper)))
 
 
 def has_computed_indices(function: Callable[..., Any]) -> bool:
-    """Return True if a function may have other indices than constants and loop counters, or if it has no source."""
+    """Return True if a user's function may have indices other than constants and loop counters, or has no source."""
     if is_twoloop(function.__module__ or "") or is_library(function.__module__ or ""):
         return False
     try:
         tree = ast.parse(textwrap.dedent(inspect.getsource(function)))
-    except (OSError, TypeError, SyntaxError):  # the function was typed at a prompt, or is only part of a statement
+    except (OSError, TypeError, SyntaxError):  # typed at a prompt, or the source is only part of a statement (lambda)
         return True
     computed = _computed_names(tree)
     return any(not _is_safe_index(node.slice, computed) for node in ast.walk(tree) if isinstance(node, ast.Subscript))
 
 
 def _computed_names(tree: ast.AST) -> set[str]:
-    """Return the variables of a function whose values may be other than constants, loop counters and array sizes."""
+    """Return names of a function's variables that may have values other than constants, loop counters, array sizes."""
     computed = {node.arg for node in ast.walk(tree) if isinstance(node, ast.arg)}
     while True:
         n_before = len(computed)
@@ -93,7 +93,7 @@ def _computed_names(tree: ast.AST) -> set[str]:
 
 
 def _is_safe_index(node: ast.AST | None, computed: set[str]) -> bool:
-    """Return True if an expression contains only constants, array sizes, and variables that are not in `computed`."""
+    """Return True if an index needs no check: it has only constants, array sizes, and variables not in `computed`."""
     if node is None or isinstance(node, ast.Constant):
         return True
     if isinstance(node, ast.Name):
@@ -107,23 +107,23 @@ def _is_safe_index(node: ast.AST | None, computed: set[str]) -> bool:
     if isinstance(node, ast.Subscript):
         return _is_safe_index(node.value, computed) and _is_safe_index(node.slice, computed)
     if isinstance(node, ast.BinOp | ast.UnaryOp | ast.Tuple | ast.List | ast.Slice):
-        kinds = (ast.operator, ast.unaryop, ast.expr_context)  # nodes of operators, not of expressions: skip them
+        kinds = (ast.operator, ast.unaryop, ast.expr_context)  # child nodes that are not expressions: skip them
         return all(_is_safe_index(each, computed) for each in ast.iter_child_nodes(node) if not isinstance(each, kinds))
     return False
 
 
 f8 = numba.types.float64
 VECTOR = numba.types.float64[::1]
-READ_ONLY_VECTOR = numba.types.Array(f8, 1, "C", readonly=True)  # in memory, the same as VECTOR
+READ_ONLY_VECTOR = numba.types.Array(f8, 1, "C", readonly=True)  # machine code for it accepts any VECTOR
 MATRIX = numba.types.float64[:, ::1]
 
-# for each vector that callbacks receive, the attribute of a system that is its size; lam: multipliers of C = 0
+# keys: names of vectors that callbacks receive (lam: multipliers of C = 0); values: attributes of a system: their sizes
 STATE_SIZES = {"q": "n_q", "v": "n_q", "lam": "n_c"}
 
 
 @dataclass(frozen=True)
 class CallbackKind:
-    """Describe one kind of callback.
+    """Kind of callback: its arguments, and what replaces it if the system has none.
 
     state : names of the arguments between t and p, such as ("q", "v"); keys of `STATE_SIZES`.
     output : name of the array that the callback fills.
@@ -148,7 +148,7 @@ class CallbackKind:
 
     @property
     def optional(self) -> bool:
-        """Return True if a system may be defined without this callback."""
+        """Return True if a system may lack this callback (subject to `needed_by`)."""
         return self.absent != ""
 
     @cached_property
@@ -163,7 +163,7 @@ class CallbackKind:
 
     @cached_property
     def signature(self) -> Any:
-        """Return the signature with which kernels call a callback: all arrays are writable."""
+        """Return the signature with which kernels call a callback: all arrays have writable types."""
         return self._signature(VECTOR)
 
     @property
@@ -172,7 +172,7 @@ class CallbackKind:
         return self._signature(READ_ONLY_VECTOR)
 
     def _signature(self, input_type: Any) -> Any:
-        """Return a signature in which all input arrays have the type `input_type`, and all outputs are writable."""
+        """Return the signature for input arrays of the type `input_type` and writable outputs."""
         output_types = [VECTOR if len(shape) == 1 else MATRIX for _, shape in self.outputs]
         return numba.types.void(f8, *[input_type] * len(self.state), input_type, *output_types)
 
@@ -311,8 +311,8 @@ def callback(kind: str, allocates: bool = True) -> Callable[[Callable[..., None]
             Cq[0, 0] = q[0]
             Cq[0, 1] = q[1]
 
-    Machine code is cached on disk. It is compiled again after a change of the function, of a helper that it calls, or
-    of a global variable that they use.
+    Machine code is cached on disk. It is compiled again after a change of the function, of a compiled function that it
+    calls, or of a global variable that they use.
 
     Parameters
     ----------
@@ -375,10 +375,10 @@ def compile_callback(
     named_function: Callable[..., Any] | None = None,
     allocates: bool = True,
 ) -> Dispatcher:
-    """Compile a function as a callback, which fills its output arrays; raise TypeError if this is impossible.
+    """Compile a function as a callback of the given kind; raise TypeError if this is impossible.
 
-    `digests`: see `compile_cached`. `named_function`: function to name in error messages, if it is not `function`.
-    `allocates`: see `callback`.
+    `digests`: see `compile_cached`. `named_function`: function to name in messages, if not `function`. `allocates`: see
+    `callback`.
     """
     compiled, more = add_bounds_checks(function)
     options = {**_NUMBA_OPTIONS, **more} if allocates else {**_NUMBA_OPTIONS, **more, "_nrt": False}
@@ -386,12 +386,12 @@ def compile_callback(
         digests = f"{digests[0]} {options}", digests[1]
     try:
         dispatcher = compile_cached(compiled, KINDS[kind].read_only_signature, digests, **options)
-    except Exception as error:  # an error of numba, or a failed assertion in numba
+    except Exception as error:  # numba reports errors in the function by many types, also failed assertions
         dispatcher = _compile_with_writable_inputs(kind, compiled, digests, named_function or function, error, options)
     else:
         add_signature(dispatcher, KINDS[kind].signature)
     if digests is not None:
-        # register the digest now: values that the function uses may change later, but the machine code will not
+        # register the digests now: values that the function uses may change later, but the machine code will not
         register_digest(dispatcher, f"{kind} {digests}")
     frozen_values(dispatcher, function)
     return dispatcher
@@ -405,9 +405,9 @@ def _compile_with_writable_inputs(
     error: Exception,
     options: dict[str, Any],
 ) -> Dispatcher:
-    """Compile a callback with writable input arrays, because its helpers may not accept read-only arrays.
+    """Compile a callback for writable input arrays, after `error` for read-only ones, which its helpers may not accept.
 
-    Raise TypeError if the callback writes to its inputs. `error`: raised with read-only inputs. See `compile_callback`.
+    Raise TypeError if it does not compile either, or if `error` shows that the callback writes to its inputs.
     """
     try:
         dispatcher = compile_cached(function, KINDS[kind].signature, digests, **options)
@@ -422,13 +422,13 @@ def _compile_with_writable_inputs(
     ) from None
 
 
-# numba's message matches this pattern if a helper does not accept read-only arrays
+# numba's message matches this pattern if a compiled function that the callback calls rejects read-only arrays
 _HELPER_REJECTS_READ_ONLY = re.compile(r"Invalid use of type\(CPUDispatcher\(")
 
 
 @cache
 def zero_callback(kind: str) -> Dispatcher:
-    """Return a compiled callback that leaves its outputs at zero, in place of an optional callback that is missing."""
+    """Return a compiled callback that leaves its outputs at zero: it replaces a missing callback of this kind."""
 
     def leave_zeros(t, q, p, out):
         pass
@@ -444,7 +444,7 @@ def zero_callback(kind: str) -> Dispatcher:
 
 
 def _failure_message(kind: str, function: Callable[..., Any], error: Exception) -> str:
-    """Return the error message for a function that numba cannot compile, with one line of numba's own message."""
+    """Return the error message for a function that numba cannot compile; it quotes one line of numba's message."""
     return (
         f"{kind}: numba cannot compile the function {_name_and_location(function)}; it must use numbers, numpy arrays "
         f"of one type and of the shape that {kind} asks for, and functions that numba knows (helpers need numba.njit)\n"
@@ -457,7 +457,7 @@ def _name_and_location(function: Callable[..., Any]) -> str:
     return f"{name!r} ({code.co_filename}, line {code.co_firstlineno})" if code else repr(name)
 
 
-# pattern of source excerpts in numba's messages; such an excerpt ends with a line that contains only ^
+# pattern of source excerpts in numba's messages; the last line of an excerpt contains only the sign ^
 _SOURCE_EXCERPT = re.compile(r"^File \".*?^[ ]*\^$", re.MULTILINE | re.DOTALL)
 # lines of numba's messages that begin like this do not state the reason for an error
 _UNINFORMATIVE_LINE = re.compile(
@@ -467,14 +467,13 @@ _UNINFORMATIVE_LINE = re.compile(
 
 
 def _remove_colours(error: Exception) -> str:
-    """Return the message of an error without the control codes that colour it in a terminal."""
     return re.sub(r"\x1b\[[0-9;]*m", "", str(error))
 
 
 def _informative_line(error: Exception) -> str:
-    """Return the type of an error, and the last line of numba's message that states a reason."""
+    """Return the name of the type of an error, and that line of numba's message which states the reason."""
     message = _remove_colours(error)
-    message = re.sub(r":\s*>>> ", ": ", _SOURCE_EXCERPT.sub("", message))  # >>> precedes a rejected signature
+    message = re.sub(r":\s*>>> ", ": ", _SOURCE_EXCERPT.sub("", message))  # remove the sign before a rejected signature
     lines = [line.strip() for line in message.splitlines() if line and not line.startswith("    ")]
     useful = [line for line in lines if line and not _UNINFORMATIVE_LINE.match(line) and not line.startswith("def ")]
     return f"{type(error).__name__}: {useful[-1] if useful else message.strip()[:200]}"
