@@ -4,7 +4,6 @@ A fixed-point iteration solves for the stages of an implicit Runge-Kutta step. E
 accelerations of all stages at once, one in each lane, and integrates them: this takes little longer than one
 evaluation. Usually the accelerations depend on some of the coordinates only: only these are iterated, and the others
 follow from the final accelerations. The ends of eight steps are projected onto the constraints at once, too.
-
 kernels/steps/lobatto_step.py calls the generated functions. They share an array `work`: see kernels/data/collocation.py
 
 The method is Lobatto IIIA with nine nodes, the first of which is the end of the previous step; its order is 16. The
@@ -78,8 +77,8 @@ def tables() -> Tables:
     values = _legendre(x)
     weights = 2 / (N * (N - 1) * values[N - 1] ** 2)
     norms = np.array([np.longdouble(2) / (2 * k + 1) for k in range(N)])
-    norms[N - 1] = np.longdouble(2) / (N - 1)  # integrals are sums over the nodes: for P_8^2, 2 / 8 and not 2 / 17
-    coefficients = values[:N] * weights / norms[:, None]  # [k, j]: coefficient of P_k, Lagrange polynomial of node j
+    norms[N - 1] = np.longdouble(2) / (N - 1)  # integral of P_8^2 by a sum over the nodes; exact: 2 / 17
+    coefficients = values[:N] * weights / norms[:, None]  # [k, j]: coefficient of P_k in Lagrange polynomial j
     powers = [
         np.array([[sign ** (n + k) * comb(n, k) * comb(n + k, k) for n in range(N)] for k in range(1, N)]).T
         for sign in (-1, 1)
@@ -115,7 +114,7 @@ def _integrals(coefficients: Extended, z: Extended) -> tuple[Extended, Extended,
     points z are on [-1, 1]; integrals are over the time (z + 1) / 2, and begin at 0.
     """
     values = _legendre(z)
-    # the integral of P_k over z from -1 is (P_k+1 - P_k-1) / (2 k + 1), or P_1 + 1 if k = 0; the double one follows
+    # the integral of P_k over z from -1 is (P_k+1 - P_k-1) / (2 k + 1), or P_1 + 1 if k = 0; `double`: same rule
     single = np.array([values[1] + 1, *((values[k + 1] - values[k - 1]) / (2 * k + 1) for k in range(1, N + 1))])
     double = np.array([single[1] + single[0], *((single[k + 1] - single[k - 1]) / (2 * k + 1) for k in range(1, N))])
     return coefficients.T @ values[:N], coefficients.T @ single[:N] / 2, coefficients.T @ double / 4
@@ -125,7 +124,8 @@ MAX_OPERATIONS = 5000  # equations with more operations get no collocation code:
 MIN_DIVISOR = 1e-300  # smaller divisors and allowed errors are replaced by this, so that nothing is divided by zero
 INVALID = -1.0  # returned by `find_defect` instead of a defect (at least 0), if pivots are too small
 INFINITE = float("inf")
-# if pivots chosen before the run get too small in a step, this many later steps use the elimination that begins with M
+# if pivots chosen before the run get too small in a step, this step and this number of later steps are computed by an
+# elimination that needs no such pivots, because it begins with the mass matrix M
 STEPS_BY_MASS_FIRST = 8.0
 FIRST_DEGREE = 3.0  # degree of the polynomial that predicts the accelerations in the second step of a run
 
@@ -137,7 +137,8 @@ MAX_CONTRACTION = 0.8  # if the contraction is at least this in the fourth sweep
 MIN_RHO, MAX_RHO = 1e-3, 0.9  # bounds to which a measured contraction is clipped
 FAST_START, SLOW_START = 0.04, 0.3  # a guessed first step size is kept if the contraction in sweep 2 is between these
 STAGNATION_RATIO = 0.5  # sweeps also end if the change may be rounding error and is at least this times the last change
-# in steps of fixed size, these replace KAPPA, MAX_ROUNDING and the largest number of sweeps
+# for steps of fixed size: limit of the error of the iteration (as KAPPA), size of changes that may be rounding errors
+# (as MAX_ROUNDING), and largest number of sweeps
 KAPPA_OF_FIXED, ROUNDING_OF_FIXED, MAX_SWEEPS_OF_FIXED = 1e-16, 1e-9, 60.0
 SMALLEST_RATIO = 1e-30  # added to (error of the iteration) / KAPPA before its logarithm is taken: the error may be 0
 ERROR_WEIGHT = 0.5  # factor on the estimated error of a step, see `_estimate_error`
@@ -191,15 +192,12 @@ class CollocationCode:
         self.structure = hashlib.sha256(repr([shared.digest, description]).encode()).hexdigest()
 
     def _find_iterated(self) -> list[int]:
-        """Return the coordinates on whose positions or velocities the accelerations depend."""
         graph, exprs = self.equations.graph, []
         for program in self.equations.accelerations:
             exprs += program.expressions
             exprs += [expr for i in program.quantities() for expr in graph.arguments(i)]
         inputs = {i for expr in exprs for i in expr.terms if graph.operations[i] is None}
         return sorted({(i - 1) % self.n for i in inputs if i > 0})
-
-    # methods that write the functions called by lobatto_step.py
 
     def iterate_step(self, emit: LaneEmitter, work: Value, state: Value, tolerances: Value, numbers: Value) -> Value:
         """Write code that solves for the stages of a step; return the status that it computes, such as CONVERGED.
@@ -383,8 +381,8 @@ class CollocationCode:
         """Write code for sweeps until the stages converge or the step is rejected; return the status that it computes.
 
         evaluate([times, *positions at the nodes]) writes the part of a sweep that stores the accelerations of the
-        coordinates on which accelerations depend. It returns a function that is called once, for code after the last
-        sweep: this stores the accelerations of the other coordinates, and computes a flag for each lane, which is 1 if
+        coordinates on which accelerations depend. It returns a second function, whose code runs after the last sweep:
+        this code stores the accelerations of the other coordinates, and computes a flag for each lane, which is 1 if
         pivots were large enough. If a flag is 0, the code that `fallback` writes computes the status instead.
         """
         builder, num = emit.builder, Emitter(emit.builder)
@@ -447,7 +445,7 @@ class CollocationCode:
 
     @contextmanager
     def _repeated(self, emit: LaneEmitter, work: Value, state: Value) -> Iterator[list[Value]]:
-        """Return a context manager: the code in its block runs once in a sweep, or twice if the field REPEATS is 1.
+        """Return a context manager: code written in its block runs once in a sweep, or twice if the field REPEATS is 1.
 
         The code computes accelerations from the velocities that the context manager yields: first, velocities of the
         last sweep; then the integrals of the accelerations just computed, so that the iteration converges faster.
@@ -467,7 +465,7 @@ class CollocationCode:
             v0, a0 = (num.load(num.pointer(state, i), m * self.n) for m in (1, 2))
             of_v = self._weighted_accelerations(emit, tables().velocities, a0, work, i)
             store_lanes(emit, emit.fma(h, of_v, emit.broadcast(v0)), num.pointer(work, k * LANES), self.spectrum_offset)
-        offset.add_incoming(integer(self.spectrum_offset), builder.block)  # where the velocities have been stored
+        offset.add_incoming(integer(self.spectrum_offset), builder.block)  # then load those just stored
         builder.jump(loop)
         builder.position_at_end(after)
 
@@ -621,8 +619,8 @@ class CollocationCode:
         """Write code that stores NEXT_DEGREE, the degree of the polynomial that predicts the next step.
 
         `max_error`: in lane k, the error that a prediction of degree k + 1 would have had at the end of this step.
-        NEXT_DEGREE is the lowest degree whose error is at most 1.2 times the smallest one, but at least 2, and at most
-        2 lower or higher than DEGREE, used for this step. If no polynomial predicted this step, it is FIRST_DEGREE.
+        NEXT_DEGREE is the lowest degree whose error is at most 1.2 times the smallest one, but at least 2, and changed
+        by at most 2 from step to step. If no polynomial predicted this step, NEXT_DEGREE is FIRST_DEGREE.
         """
         builder, num = emit.builder, Emitter(emit.builder)
         least = -emit.max_over_lanes(-max_error)
@@ -644,13 +642,11 @@ class CollocationCode:
             self._project_in_parts(emit, work, numbers, self.split_functions.project_position, ("moved", "q"))
 
     def project_states(self, emit: LaneEmitter, work: Value, numbers: Value) -> None:
-        """Write code that projects the ends of eight steps at once, with accelerations and multipliers."""
+        """Write code that projects the ends of eight steps at once, and computes accelerations and multipliers."""
         if self.split_functions is None:
             self._project(emit, work, numbers, self.equations.projection)
         else:
             self._project_in_parts(emit, work, numbers, self.split_functions.project, ("a", "moved", "q", "v", "lam"))
-
-    # methods that write parts of functions
 
     def _project(self, emit: LaneEmitter, work: Value, numbers: Value, program: Program) -> None:
         """Write code that projects the ends of eight steps by `program`, and stores the results in `work`."""
@@ -667,7 +663,7 @@ class CollocationCode:
     def _project_in_parts(
         self, emit: LaneEmitter, work: Value, numbers: Value, write: Callable[..., Value], names: tuple[str, ...]
     ) -> None:
-        """Do the same as `_project` for equations split into several functions: `write` writes the calls of these."""
+        """Do the same as `_project` for equations split into several functions: `write` writes calls of these."""
         num, moved = Emitter(emit.builder), emit.builder.allocate(DOUBLE, LANES * self.n)
         indices = {name: num.pointer(work, index) for name, index in self._end_offsets().items()} | {"moved": moved}
         state = load_lanes(emit, work, self.end_offset), indices["q"], indices["v"]
@@ -707,7 +703,7 @@ class CollocationCode:
     def _store_stages(
         self, emit: LaneEmitter, work: Value, state: Value, k: Value, i: Value, sums: Sequence[Value]
     ) -> Value:
-        """Write code that stores v and q of the k-th iterated coordinate, i; return v. `sums`: integrals of its a."""
+        """Write code for v and q of the k-th iterated coordinate, i, by the integrals `sums` of its a; return v."""
         num = Emitter(emit.builder)
         h = emit.broadcast(num.load(work, mem.H))
         index, begin = num.pointer(work, k * LANES), num.pointer(state, i)

@@ -36,16 +36,16 @@ from twoloop.kernels.compile.generated_functions import generated_functions
 from twoloop.problem.system import ConstrainedSystem
 
 DOUBLE_POINTER = f"{DOUBLE}*"
-# if the relative error of accelerations near the start is larger, generated code is not used. This is checked only if
-# rows of G are added to M, or solutions are refined (see PivotChoice). During runs, the error grew up to 200 times
+# generated code is not used if the relative error of its accelerations near the start is larger. This is checked only
+# if rows of G are added to M, or solutions are refined (see PivotChoice). During runs, the error grew up to 200 times
 LARGEST_LOSS = 1e-8
-MAX_POSITIONS, DISTANCE = 4, 0.02  # `_loss` tries at most this number of positions, with this spacing (m or rad)
+MAX_POSITIONS, SPACING = 4, 0.02  # the error is measured at one of these positions, with this spacing (m or rad)
 
 
 def write_accelerations(
     emit: Emitter, equations: Elimination, inputs: Sequence[Value], numbers: Coefficients
 ) -> tuple[list[Value], Value]:
-    """Write code for the accelerations at `inputs`, [t, q, v]; return the accelerations and a flag: 1 if valid.
+    """Write code for the accelerations at `inputs`, [t, q, v]; return them and a flag: 1 if pivots are large enough.
 
     `numbers`: the coefficients and their indices in an array; `emit` must have pointers to this array.
     """
@@ -226,8 +226,6 @@ class SplitFunctions:
             llvm_code.write(module, name, kinds(name), emit)
         return list(functions)
 
-    # methods that write the functions of the parts
-
     def _call(self, emit: Emitter, *calls: tuple[str, Sequence[Value]]) -> Value:
         """Write calls, given as (part, arguments), and the parts that are missing; return a flag: 1 if all return 1."""
         module, all_valid = emit.builder.module, None
@@ -251,7 +249,7 @@ class SplitFunctions:
         return lowering
 
     def _write_factors(self, emit: Emitter, *arguments: Value) -> Value:
-        """Write the part "factors", which stores factors in `arguments[4]`; return a flag: 1 if pivots are large."""
+        """Write the part "factors", which stores in `arguments[4]`; return a flag: 1 if pivots are large enough."""
         graph, solution, stored = self.equations.graph, self.solution, arguments[4]
         lowering = self._lowering(emit, graph, arguments, {})
         locations = {i: (stored, index) for i, index in solution.stored_indices.items()}
@@ -262,7 +260,7 @@ class SplitFunctions:
         return lowering.is_valid(solution.factor_program, [])
 
     def _write_part(self, program: Program, stored: Mapping[int, int], emit: Emitter, *arguments: Value) -> Value:
-        """Write a part that runs `program`; return a flag: 1 if valid. `stored`: indices in memory, by quantity."""
+        """Write a part that runs `program`; return a flag: 1 if valid. `stored`: where to load quantities from."""
         locations = {i: (arguments[4], index) for i, index in stored.items()}
         lowering = self._lowering(emit, program.graph, arguments, locations)
         results = program.run(lowering)
@@ -480,14 +478,14 @@ def generated_code(system: ConstrainedSystem, t0: float, q0: Array, check: Check
             return SharedCode(Elimination(system, choice, cache.equations(system)), cache)
 
         code: GeneratedCode = derive_cached(system, ("code", choice), generate, lambda code: check(code.traced))
-        if (choice.added_rows or choice.is_refined) and not _loss(code, system, t0, q0) <= LARGEST_LOSS:
+        if (choice.added_rows or choice.is_refined) and not _relative_error(code, system, t0, q0) <= LARGEST_LOSS:
             raise Untraceable(f"elimination without pivots loses the digits of little inertia in {system.name!r}")
     except Untraceable as error:
         raise ValueError(f"compiled=True needs equations that can be written down; {error}. Leave it out") from error
     return code
 
 
-def _loss(code: GeneratedCode, system: ConstrainedSystem, t0: float, q0: Array) -> float:
+def _relative_error(code: GeneratedCode, system: ConstrainedSystem, t0: float, q0: Array) -> float:
     """Return the relative error of accelerations by generated code, at rest, at the start (t0, q0) or near it.
 
     At most MAX_POSITIONS positions are tried until pivots are large enough; if they never are, return infinity. Two
@@ -498,7 +496,7 @@ def _loss(code: GeneratedCode, system: ConstrainedSystem, t0: float, q0: Array) 
     scratch, new_v, addresses = np.empty((2, n)), np.zeros(n), code.shared.functions.addresses
     kinds = [kind for kind, size in (("gamma", system.n_c), ("nonholonomic_gamma", system.n_a)) if size]
     for k in range(MAX_POSITIONS):
-        q = q0 + k * DISTANCE * np.cos(np.arange(n))
+        q = q0 + k * SPACING * np.cos(np.arange(n))
         if _call(addresses["own_project"], t0, q, v, code.numbers, a, *scratch, new_v, lam):
             break
     else:
@@ -520,7 +518,6 @@ def _loss(code: GeneratedCode, system: ConstrainedSystem, t0: float, q0: Array) 
 
 
 def _call(address: int, t: float, *arrays: Array) -> bool:
-    """Call the generated function at `address` with the time and arrays; return its result."""
     function = ctypes.CFUNCTYPE(ctypes.c_bool, ctypes.c_double, *[ctypes.c_void_p] * len(arrays))(address)
     return bool(function(t, *(x.ctypes.data for x in arrays)))
 

@@ -20,7 +20,7 @@ from twoloop.generate.trace import GAMMA_SOURCES, Equations, Evaluator, TraceCac
 from twoloop.generate.traced_values import CallbackTraces, Check, accept_traces
 from twoloop.problem.system import ConstrainedSystem
 
-# keys: callbacks that are derived if the user does not give them; values: attribute of a system with their row number
+# keys: callbacks that are derived if the user does not give them; values: attribute of a system, their number of rows
 DERIVABLE_CALLBACKS = {"jacobian": "n_c", "gamma": "n_c", "nonholonomic_gamma": "n_a"}
 
 
@@ -102,7 +102,7 @@ def _missing_derivatives(equations: Equations, missing: Sequence[str]) -> dict[s
 Array = NDArray[np.float64]
 
 MAX_ENTRIES = 50_000  # callbacks are not compared with exact derivatives if G = [C_q; A] has more entries
-# derivatives are compared at three states: at the start, displaced by these multiples of the sizes of q, and of time
+# callbacks are compared with derivatives at three states: the start plus these multiples of the sizes of q and t
 DISPLACEMENTS = (0.0, 1e-3, 0.03)
 
 

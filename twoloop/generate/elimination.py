@@ -47,15 +47,15 @@ from twoloop.problem.system import ConstrainedSystem
 Array = NDArray[np.float64]
 
 SINGULAR_MASS = 1e-10  # M is singular if its smallest eigenvalue is below this fraction of its largest eigenvalue
-RANK_TOL = 1e-9  # a row of G depends on others if its part orthogonal to them is below this fraction of it
+RANK_TOL = 1e-9  # a row of G depends on others if the norm of its part orthogonal to them is below this * its norm
 # relative pivot of a row of G: its pivot / the pivot that it would have if G had no other rows. Generated code accepts
-# relative pivots down to `min_pivot`, which is about this fraction of the smallest one at the start
+# relative pivots down to a lower limit, which is about this fraction of the smallest one at the start
 PIVOT_FRACTION = 0.01
-MIN_PIVOTS = 10.0 ** np.arange(-2, -9, -1)  # values of `min_pivot`; at smaller pivots, rounding errors would dominate
-# `min_pivot` is MIN_PIVOTS[i] for the first i with START_LIMITS[i] <= smallest relative pivot at the start; if there is
-# no such i, it is MIN_PIVOTS[-1]
+MIN_PIVOTS = 10.0 ** np.arange(-2, -9, -1)  # possible lower limits; at smaller pivots, rounding errors dominate
+# the limit is MIN_PIVOTS[i] for the first i with START_LIMITS[i] <= smallest relative pivot at the start; if no i has
+# this property, it is MIN_PIVOTS[-1]
 START_LIMITS = MIN_PIVOTS[:-1] / PIVOT_FRACTION
-# if `min_pivot` is 10^-(k + 2), and k is at least the following limit, M + s G^T G replaces M on trial:
+# M + s G^T G (s: scales) replaces M on trial if the lower limit of relative pivots is MIN_PIVOTS[i], with i at least
 # - MIN_INDEX_FEW, for at most N_FEW_COORDINATES coordinates
 # - MIN_INDEX_FEW_SINGULAR, if M is also singular: Euler parameters lose two digits even in sound models
 # - MIN_INDEX_MANY (plus one if M is singular), for more coordinates, because the code gets longer
@@ -63,9 +63,9 @@ N_FEW_COORDINATES = 24
 MIN_INDEX_FEW, MIN_INDEX_FEW_SINGULAR, MIN_INDEX_MANY = 4, 5, 6
 ADDED_SIZE = 16.0  # if s G^T G is added to M, its largest entry is about this many times the largest entry of M
 MAX_PIVOT_RATIO = 1e5  # solutions are refined if a diagonal entry of M with added rows is larger than this * its pivot
-SCALE_STEP = 1024.0  # ratios of scales s are powers of this number; as it is large, most starts have the same code
+SCALE_STEP = 1024.0  # scales of rows differ by powers of this number; as it is large, most starts have the same code
 DISPLACEMENT = 0.2  # displacement of coordinates (m or rad) to a position where no entry of M and G is zero by chance
-MIN_GAIN = 2  # M + s G^T G replaces M if this raises `min_pivot` by at least this number of powers of ten
+MIN_GAIN = 2  # M + s G^T G replaces M if the lower limit of relative pivots rises by at least this many powers of ten
 # dependent coordinates are eliminated (null_space.py) only if there are at least this many constraints per coordinate:
 # otherwise the linear system for the multipliers is smaller
 MIN_ROW_RATIO = 2.0 / 3.0
@@ -104,7 +104,7 @@ class PivotChoice:
         choice = PivotChooser(system).choose(mass, G, partial(_nearby, system, t, q))
         # refine solutions only if min_pivot is the smallest possible one, or if light bodies may lose digits: in all
         # other cases, random models had 8 correct digits without refinement
-        is_uncertain = choice.min_pivot <= MIN_PIVOTS[-1] or _hides_little_inertia(choice, mass, G)
+        is_uncertain = choice.min_pivot <= MIN_PIVOTS[-1] or _may_lose_digits(choice, mass, G)
         choice = replace(choice, is_refined=choice.is_refined or (bool(choice.rows) and is_uncertain))
         return replace(choice, blocks=DependentColumns(system, choice.rows).blocks(G))
 
@@ -158,7 +158,7 @@ def _entry_kinds(system: ConstrainedSystem) -> Any:
 
 
 class PivotChooser:
-    """Compiled search for the rows and pivots of the elimination at any position of a system; it keeps its arrays."""
+    """Compiled search, with its scratch arrays, for the rows and pivots of the elimination at positions of a system."""
 
     def __init__(self, system: ConstrainedSystem):
         from twoloop.kernels.linalg.rank import choose_rows, workspace_size
@@ -183,11 +183,11 @@ class PivotChooser:
         index = self._kernel(mass, G, RANK_TOL, 0.0 if is_definite else SINGULAR_MASS, START_LIMITS, scratch, chosen)
         key = index, chosen.tobytes(), float(scratch[0])
         if key != self._last_key:
-            self._last_choice, self._last_key = self._decode(index), key
+            self._last_choice, self._last_key = self._stored_choice(index), key
         choice, is_singular = self._last_choice, bool(self._last_choice.added_rows)
         factors = _scale_factors(choice.added_rows, *nearby()) if is_singular else np.ones(len(G))
         scales = tuple((choice.scales[0] * factors[list(choice.added_rows)]).tolist()) if is_singular else ()
-        new_index = self._index_with(choice, scales, mass, G) if scales != choice.scales else -1
+        new_index = self._min_pivot_index(choice, scales, mass, G) if scales != choice.scales else -1
         if new_index >= 0:
             choice, index = replace(choice, scales=scales, min_pivot=float(MIN_PIVOTS[new_index])), new_index
         if index >= (
@@ -198,8 +198,8 @@ class PivotChooser:
             return self._try_added_rows(choice, factors, mass, G, index)
         return choice
 
-    def _index_with(self, choice: PivotChoice, scales: Sequence[float], mass: Array, G: Array) -> int:
-        """Return the index of `min_pivot` in MIN_PIVOTS if the rows `choice.added_rows` are added to M with `scales`.
+    def _min_pivot_index(self, choice: PivotChoice, scales: Sequence[float], mass: Array, G: Array) -> int:
+        """Return the index of the smallest allowed pivot in MIN_PIVOTS if `choice.added_rows` are added to M, scaled.
 
         Return -1 if M with added rows is not positive definite, or if the independent rows differ from `choice.rows`.
         """
@@ -215,19 +215,19 @@ class PivotChooser:
         A body may have little inertia about its joints, such as a rod with a mass in its middle. Then rows of G are
         nearly dependent in the metric of M, and a smallest pivot of 10^-k costs up to 2 k digits of accelerations. In
         the metric of M + s G^T G, they are not. If s G^T G is 10^k times as large as M, k digits are lost, and
-        refinement restores them. `factors`: of the scales s of rows; `index`: choice.min_pivot is MIN_PIVOTS[index].
+        refinement restores them. `factors` multiply the scales s; `index`: choice.min_pivot is MIN_PIVOTS[index].
         """
         rows = G[list(choice.rows)]
         scale = 2.0 ** np.round(np.log2(ADDED_SIZE * np.abs(mass).max() / np.abs(rows).max() ** 2))
         scales = tuple((scale * factors[list(choice.rows)]).tolist())
         stiffened = replace(choice, added_rows=choice.rows, scales=scales, is_refined=True)
-        new_index = self._index_with(stiffened, scales, mass, G)
+        new_index = self._min_pivot_index(stiffened, scales, mass, G)
         if not 0 <= new_index <= index - MIN_GAIN:
             return choice
         return replace(stiffened, min_pivot=float(MIN_PIVOTS[new_index]))
 
-    def _decode(self, index: int) -> PivotChoice:
-        """Return the choice that the compiled search stored; if its result `index` is < 0, M is singular: raise."""
+    def _stored_choice(self, index: int) -> PivotChoice:
+        """Return the choice that the compiled search stored; raise Untraceable if its result `index` is negative."""
         from twoloop.kernels.linalg.rank import STAYS_SINGULAR
 
         system, n_rows = self.system, self.system.n_c + self.system.n_a
@@ -266,12 +266,12 @@ def _scale_factors(singular: Sequence[int], mass: Array, G: Array) -> Array:
     own /= np.maximum(rows.max(axis=1, initial=0.0), np.finfo(float).tiny) ** 2
     ratio = own / (np.abs(mass).max() / rows.max() ** 2)
     smaller = (ratio > 0.0) & ~rows[:, ~covered].any(axis=1)
-    # 0.25: the factor is 1 for ratios down to SCALE_STEP ** -1.25, which cost no digits
+    # with 0.25 added, the factor is 1 for ratios down to SCALE_STEP ** -1.25, which cost no digits
     steps = np.ceil(np.log(np.where(smaller, ratio, 1.0)) / np.log(SCALE_STEP) + 0.25)
     return np.asarray(SCALE_STEP ** np.minimum(steps, 0.0))
 
 
-def _hides_little_inertia(choice: PivotChoice, mass: Array, G: Array) -> bool:
+def _may_lose_digits(choice: PivotChoice, mass: Array, G: Array) -> bool:
     """Return True if light bodies may lose digits: rows are added to M with several scales, or a pivot is small."""
     if not choice.added_rows:
         return False
@@ -369,7 +369,7 @@ class Elimination:
         return matrix
 
     def _solve(self, r: Sequence[Affine], c: Sequence[Affine]) -> tuple[list[Affine], list[tuple[Affine, Affine]]]:
-        """Return [a, lam] that solve M a + G^T lam = r, G a = c, and their conditions; c has entries for all rows."""
+        """Return [a, lam] that solve M a + G^T lam = r, G a = c, and conditions for it; c has entries for all rows."""
         return solve_refined(self.factors.solve, self.choice, self.mass, self.all_rows, r, c)
 
     def _right_sides(self, v: Sequence[Affine]) -> tuple[list[Affine], list[Affine]]:
@@ -420,7 +420,7 @@ class Elimination:
         return Program(self.graph, {"r": force, "c": [x if k in used else self.zero for k, x in enumerate(gamma)]})
 
     def _accelerations(self, v: Sequence[Affine]) -> tuple[list[Affine], list[tuple[Affine, Affine]]]:
-        """Return accelerations at velocities v and multipliers of independent rows in one list, and conditions."""
+        """Return a list of the accelerations at velocities v and multipliers of independent rows, and conditions."""
         return self._solve(*self._right_sides(v))
 
     def _expand_to_all_rows(self, independent: Sequence[Affine]) -> list[Affine]:

@@ -58,8 +58,8 @@ class Graph(SymbolicObject):
         self.input_masks: list[int] = []  # for each quantity, a bit mask of the inputs that it depends on
         self.traced: dict[str, Any] = {}
         self._recorded_quantities: dict[tuple[int, int, int], int] = {}
-        # 0, 1, ... for factors of products in the order of first use (keys: `identifier`). A product begins with the
-        # factor used first, so that the order of its factors does not depend on the values of parameters
+        # numbers of factors of products, in the order of first use; keys: `identifier` of the factor. A product begins
+        # with the factor used first, so that the order of its factors does not depend on the values of parameters
         self._factor_order: dict[int, int] = {}
         self._identifiers: dict[Any, int] = {}  # results of `identifier`, by keys of expressions
         self._quantities: dict[int, Affine] = {}
@@ -467,7 +467,7 @@ def is_zero(expr: Affine) -> bool:
 
 
 class Derivative:
-    """Directional derivatives of expressions; `direction`: its nonzero components, by indices of inputs."""
+    """Derivatives of expressions along a direction; `direction`: its nonzero components, by indices of inputs."""
 
     def __init__(self, graph: Graph, direction: dict[int, Affine]):
         self.graph = graph

@@ -48,7 +48,8 @@ from twoloop.kernels.lanes.layout import CODE
 from twoloop.problem.system import ConstrainedSystem
 
 # constants of Taylor steps, as in kernels/steps/taylor_step.py
-# if a step is rejected because PREDICTION_ERROR > 1, the next step size is such that this error becomes TARGET_ERROR
+# if a step is rejected because the projection changes q by more than a limit, a shorter step is to change q by this *
+# the limit
 TARGET_ERROR = 0.3
 MIN_FACTOR, SAFETY, MAX_FACTOR = 0.1, 0.9, 5.0  # smallest ratio of successive step sizes, safety factor, largest ratio
 MAX_REJECTIONS = 10  # a run with more successive rejected steps than this is repeated outside the lanes
@@ -137,7 +138,7 @@ class LaneSteps:
             store_mask(emit, work, field, is_continued)
 
     def evaluate_series(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Write code that evaluates the series at the end of the step, and stores NEW, `series_a` and `predicted`."""
+        """Write code that evaluates the series at the end of the step, and stores NEW, its q also in `predicted`."""
         memory = self.memory(emit, order, control, work)
         for j, q in enumerate(self.evaluate_positions(emit, memory, emit.load(work, lanes.X))):
             emit.store(q, memory.predicted, j)
@@ -406,13 +407,13 @@ class LaneStages:
         error = e / emit.function("sqrt", 1.0 + ratio * ratio)
         select, compare = emit.builder.select, emit.builder.compare
         error = select(compare("fcmp ogt", e, zero), error, zero)
-        # the maxima e and d ignore NaN; `total`, a sum of zeros, is NaN if a value is not finite
+        # the maxima e and d ignore NaN; `total`, a sum of 0 * values, is NaN if a value is not finite
         error = select(compare("fcmp oeq", total, zero), error, emit.constant(math.inf))
         emit.store(error, work, lanes.ERROR)
 
 
 class _Coordinate:
-    """State before the step of coordinate j, in a loop over j, and its accelerations at the first `count` stages."""
+    """Coordinate j in a loop over j: its state before the step, and accelerations at the first `count` stages."""
 
     def __init__(self, stages: LaneStages, emit: LaneEmitter, memory: LaneMemory, j: Value, count: int):
         n, self.emit, self.new, self.n = stages.n, emit, emit.pointer(memory.new, j), stages.n
@@ -522,8 +523,6 @@ class LaneCode(LaneSteps):
             description += list(numbers.structure(self.solution.solution_program))
         return hashlib.sha256(repr(description).encode()).hexdigest()
 
-    # methods that write the generated functions
-
     def compute_series(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
         """Write code for the Taylor coefficients of q(t) from STATE on in each lane, with UNIT as unit of time."""
         builder, n, memory = emit.builder, self.n, self.memory(emit, order, control, work)
@@ -578,7 +577,7 @@ class LaneCode(LaneSteps):
         emit.store(builder.select(is_last, t1, t + h), work, lanes.T_NEW)
 
     def correct_positions(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Write code for a Newton step of q in NEW where ACTIVE is 1; ACTIVE = UNCONVERGED = 1 where valid, else 0."""
+        """Write code for a Newton step of q in NEW where ACTIVE is 1; then ACTIVE = UNCONVERGED = 1 (valid) or 0."""
         is_active, _ = self._project(
             emit, self.equations.position_projection, lanes.ACTIVE, self.memory(emit, order, control, work)
         )

@@ -3,7 +3,6 @@
 A Taylor series is computed order by order, with recurrences: coefficient k of a product of two series X and Y is the
 sum of X[j] Y[k - j] over 0 <= j <= k. The series X and Y are called factors. Their coefficients are stored in rows: the
 row of order k contains coefficient k of every factor. A factor that several products share is stored once.
-
 Usually each lane has its own run. In collocation steps, each lane has one stage of the same run.
 """
 
@@ -470,7 +469,7 @@ class LaneSeries:
 
 
 class _Row:
-    """Row in memory with the coefficients of one order, one for each factor; values that were stored are not loaded."""
+    """Row in memory with the coefficients of one order, one for each factor; stored values are not loaded again."""
 
     def __init__(self, code: LaneSeries, emit: LaneEmitter, base: Value):
         self.code, self.emit, self.base = code, emit, base
@@ -491,8 +490,8 @@ class _Row:
 class _PartialSums(NamedTuple):
     """Sums of X[j] Y[k - j] over 1 < j < k, and the rows needed to add the terms j = 1 and j = k, which are missing."""
 
-    sums: dict[tuple[tuple[int, int], bool], Value]  # see `LaneSeries._write_sums`
-    first_row: Value  # pointer to the row of order 1; if k is 1, to a row of zeros: the product with it is 0
+    sums: dict[tuple[tuple[int, int], bool], Value]  # keys: ((index of X, index of Y), True for Y[k + 1 - j])
+    first_row: Value  # pointer to the row of order 1; if k is 1, to a row of zeros: products with it are then 0
     row_1: Value  # pointer to the row of order 1
     row_before: _Row  # row of order k - 1
 

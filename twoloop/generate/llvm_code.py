@@ -5,8 +5,7 @@ lists of operations are written as LLVM functions, which kernels call by their a
 inline, so that the processor computes the sines and cosines of several angles in parallel.
 
 The code reads coefficients from memory, so that all mechanisms with the same structure of the equations share it.
-
-LLVM compiles short blocks of instructions faster. So the blocks of long functions may be split into parts.
+LLVM compiles short blocks of instructions faster: therefore, the blocks of long functions may be split into parts.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence

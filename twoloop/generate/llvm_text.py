@@ -38,7 +38,6 @@ class Value:
     """Value of an LLVM function (a number, a vector or a pointer): its type and its text.
 
     Operators append an instruction to the function, and return its result. One operand may be a literal number.
-
     builder : builder of the function. A literal may have none: then the other operand of an operation must have one.
     """
 
