@@ -122,7 +122,7 @@ def _integrals(coefficients: Extended, z: Extended) -> tuple[Extended, Extended,
 
 MAX_OPERATIONS = 5000  # equations with more operations get no collocation code: to compile it would take more than 2 s
 MIN_DIVISOR = 1e-300  # smaller divisors and allowed errors are replaced by this, so that nothing is divided by zero
-INVALID = -1.0  # returned by `find_defect` instead of a defect (at least 0), if pivots are too small
+INVALID = -1.0  # returned by `find_defect` instead of a defect (at least 0), if accelerations cannot be computed
 INFINITE = float("inf")
 # if pivots chosen before the run get too small in a step, this step and this number of later steps are computed by an
 # elimination that needs no such pivots, because it begins with the mass matrix M
@@ -249,7 +249,7 @@ class CollocationCode:
 
         if self.has_reduced:
             n_careful = num.load(work, mem.N_MASS_FIRST)
-            with self._returning_if(emit, n_careful > 0.0):
+            with self._return_if(emit, n_careful > 0.0):
                 num.store(n_careful - 1.0, work, mem.N_MASS_FIRST)
                 builder.ret(iterate_mass_first())
         self._call(emit, "begin_nodes", self._predict_nodes, [work, state, tolerances])
@@ -286,7 +286,7 @@ class CollocationCode:
         return [load_lanes(emit, work, self.a_offset + LANES * i) for i in range(self.n)]
 
     @contextmanager
-    def _returning_if(self, emit: LaneEmitter, condition: Value) -> Iterator[None]:
+    def _return_if(self, emit: LaneEmitter, condition: Value) -> Iterator[None]:
         """Return a context manager for code that runs only if `condition` is true, and that ends with a return."""
         builder = emit.builder
         return_block, next_block = builder.append_block(), builder.append_block()
@@ -341,7 +341,7 @@ class CollocationCode:
         degree = emit.broadcast(num.load(work, mem.DEGREE))
         exponents = constants([float(k) for k in range(LANES)])
         used_powers = builder.select(exponents < degree, powers, emit.constant(0.0))
-        polynomial = self._polynomial_pointer(emit, work, other=False)
+        polynomial = self._polynomial_pointer(emit, work, is_next=False)
         nodes = np.array(tables().nodes)
         # row k contains the single (`velocities`) or double (`positions`) integrals of x^k from 0 to the nodes 1 to 8
         velocities = np.array([nodes ** (k + 1) / (k + 1) for k in range(LANES + 1)])
@@ -382,8 +382,8 @@ class CollocationCode:
 
         evaluate([times, *positions at the nodes]) writes the part of a sweep that stores the accelerations of the
         coordinates on which accelerations depend. It returns a second function, whose code runs after the last sweep:
-        this code stores the accelerations of the other coordinates, and computes a flag for each lane, which is 1 if
-        pivots were large enough. If a flag is 0, the code that `fallback` writes computes the status instead.
+        this code stores the accelerations of the other coordinates, and computes a flag for each lane: 1 if they are
+        finite and pivots are large enough. If a flag is 0, the code that `fallback` writes computes the status instead.
         """
         builder, num = emit.builder, Emitter(emit.builder)
 
@@ -433,7 +433,7 @@ class CollocationCode:
         builder.branch(stops, after, loop)
         builder.position_at_end(after)
         all_valid = builder.call(f"llvm.vector.reduce.and.v{LANES}i1", BIT, [store_others()])
-        with self._returning_if(emit, all_valid ^ Value(BIT, "true")):
+        with self._return_if(emit, all_valid ^ Value(BIT, "true")):
             builder.ret(fallback())
         for value, index in ((sweep, mem.SWEEPS), (change, mem.CHANGE), (target, mem.N_TARGET), (rho_now, mem.RHO)):
             num.store(value, work, index)
@@ -523,7 +523,7 @@ class CollocationCode:
     def find_defect(self, emit: LaneEmitter, work: Value, state: Value, numbers: Value) -> Value:
         """Write code for the largest defect at midpoints between nodes, relative to ALLOWED_DEFECT; return its value.
 
-        The value is INVALID if pivots are too small to compute the accelerations. The code also stores
+        The value is INVALID if pivots are too small, or accelerations are not finite. The code also stores
         FACTOR_OF_DEFECT, the largest ratio of the next step size to this one that the defect allows.
         """
         builder, num, n = emit.builder, Emitter(emit.builder), self.n
@@ -559,7 +559,7 @@ class CollocationCode:
 
     def store_prediction(self, emit: LaneEmitter, work: Value, state: Value) -> None:
         """Write code that stores the polynomial of accelerations of a rejected step, to predict a shorter step."""
-        num, old_polynomial = Emitter(emit.builder), self._polynomial_pointer(emit, work, other=False)
+        num, old_polynomial = Emitter(emit.builder), self._polynomial_pointer(emit, work, is_next=False)
         with loop_over_coordinates(emit, self.iterated_coordinates) as (k, i, _, _):
             a0 = num.load(num.pointer(state, i), 2 * self.n)
             store_lanes(
@@ -575,8 +575,8 @@ class CollocationCode:
         """
         builder, num, n = emit.builder, Emitter(emit.builder), self.n
         last, h = LANES - 1, num.load(work, mem.H)
-        powers, new = load_lanes(emit, work, mem.POWERS), self._polynomial_pointer(emit, work, other=True)
-        old_polynomial, zero = self._polynomial_pointer(emit, work, other=False), emit.constant(0.0)
+        powers, new = load_lanes(emit, work, mem.POWERS), self._polynomial_pointer(emit, work, is_next=True)
+        old_polynomial, zero = self._polynomial_pointer(emit, work, is_next=False), emit.constant(0.0)
         with loop_over_coordinates(emit, self.iterated_coordinates, [zero]) as (k, i, (max_error,), carried):
             stage = num.pointer(work, k * LANES)
             target = num.pointer(new_state, i)
@@ -733,10 +733,10 @@ class CollocationCode:
             sums[(k + 1) % 2] = emit.fma(emit.broadcast(x), constants(row), sums[(k + 1) % 2])
         return emit.add_sums(*sums)
 
-    def _polynomial_pointer(self, emit: LaneEmitter, work: Value, other: bool) -> Value:
-        """Return a pointer to the polynomial that predicts this step or, if `other` is true, the next step."""
+    def _polynomial_pointer(self, emit: LaneEmitter, work: Value, is_next: bool) -> Value:
+        """Return a pointer to the polynomial that predicts this step or, if `is_next`, the next step."""
         builder, num = emit.builder, Emitter(emit.builder)
-        second = builder.compare("fcmp one" if not other else "fcmp oeq", num.load(work, mem.CURRENT), llvm_code.ZERO)
+        second = builder.compare("fcmp one" if not is_next else "fcmp oeq", num.load(work, mem.CURRENT), llvm_code.ZERO)
         size = LANES * len(self.iterated_coordinates)
         offset = builder.select(second, integer(self.polynomial_offset + size), integer(self.polynomial_offset))
         return num.pointer(work, offset)

@@ -67,7 +67,7 @@ def write_acceleration_function(
 ) -> None:
     """Write the LLVM function `name`, which computes accelerations from t, q, v and the coefficients.
 
-    If they are valid, it stores them in its last argument and returns 1; else it returns 0. `kind`: its LLVM types.
+    If they are valid, it stores them in its last argument and returns 1; else 0. `kind`: types of result and arguments.
     """
 
     def emit_all(emit: Emitter, t: Value, q: Value, v: Value, coefficients: Value, out: Value) -> Value:
@@ -439,7 +439,7 @@ class SharedCode:
 
 
 class GeneratedCode(NamedTuple):
-    """Compiled functions together with the coefficients in the equations of one system, which they read."""
+    """Compiled functions together with the coefficients for one system, which the functions read."""
 
     shared: SharedCode
     numbers: Array  # values of the coefficients that the code reads

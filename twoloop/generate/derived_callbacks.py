@@ -102,7 +102,7 @@ def _missing_derivatives(equations: Equations, missing: Sequence[str]) -> dict[s
 Array = NDArray[np.float64]
 
 MAX_ENTRIES = 50_000  # callbacks are not compared with exact derivatives if G = [C_q; A] has more entries
-# callbacks are compared with derivatives at three states: the start plus these multiples of the sizes of q and t
+# callbacks are compared with derivatives at the start plus these multiples of the sizes of q, and of a time scale
 DISPLACEMENTS = (0.0, 1e-3, 0.03)
 
 
@@ -157,7 +157,7 @@ def has_exact_derivatives(system: ConstrainedSystem, t: float, q: Array, v: Arra
 
 
 def generic_states(states: Sequence[tuple[float, Array, Array]]) -> Array:
-    """Return rows [t, q, v] with t and q of `states`, and random velocities v that are not smaller than the given v."""
+    """Return rows [t, q, v] with t and q of `states`, and random velocities, about as large as given v or larger."""
     times, positions, velocities = (np.array(values, dtype=float) for values in zip(*states, strict=True))
     generic_v = np.array([sizes(q) for q in positions]) * _random_factors(*positions.shape)
     scale = max(1.0, float(np.abs(velocities).max()) / float(np.abs(generic_v).max()))
