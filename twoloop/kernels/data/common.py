@@ -1,4 +1,4 @@
-"""Define what all kernels share: types, compiling decorators, the workspace, the table of callbacks, tolerances.
+"""Define what all kernels share: types, compiling decorators, the kit of functions, the workspace, and tolerances.
 
 A kernel is a compiled function of this package. Each kind of callback has a fixed signature, and writes its results
 into an argument. So kernels are compiled once, and receive the functions of any mechanism and any method as arguments.
@@ -30,8 +30,8 @@ i8 = types.int64
 INTEGERS = types.int64[::1]
 INTEGERS_32 = types.int32[::1]  # for programs (lists of operations) so long that 64-bit integers overfill the cache
 
-# names of the programs (lists of operations) in `Functions`. jacobian_... and gamma_... replace missing callbacks, see
-# evaluation/operations.py. ldl_program and newton_program factor the matrices of large systems, see
+# programs (recorded lists of operations) in `Functions`. jacobian_... and gamma_... replace callbacks that the user did
+# not give, see evaluation/operations.py. ldl_program and newton_program factor the matrices of large systems, see
 # linalg/symbolic_factorization.py and sparse_lu.py. The array of a missing program has size 0
 PROGRAMS = "jacobian_program", "jacobian_numbers", "gamma_program", "gamma_numbers", "ldl_program", "newton_program"
 # what kernels know of a mechanism: callbacks (KINDS), parameters `p`, flags (see indices.py) and programs
@@ -56,26 +56,26 @@ class Work(NamedTuple):
     W: Any  # (r_v, n_q) G M^-1 (G: independent rows of the constraint Jacobian; M: mass matrix)
     A: Any  # (n_dof, n_dof) reduced mass matrix T^T M T (T: null space of G), then its factors; empty where S is used
     MT: Any  # (n_q, n_dof) mass matrix times T, whose columns are the null space of the constraint Jacobian
-    # null space of G = [G_d G_i]: row j of -(G_d^-1 G_i)^T contains the dependent velocities (in order of elimination)
-    # for independent velocity j = 1 and the others 0. The last row of D contains the dependent velocities due to drives
+    # null space of G: row j contains the dependent velocities (in order of elimination) if independent velocity j is 1
+    # and the others are 0. Last row: dependent velocities due to drives (C_t and b) if all independent ones are 0
     D: Any  # (n_dof + 1, r_v) null space of the constraint Jacobian G; last row: velocities due to drives
     Gx: Any  # (n_c + n_a, n_q) constraint Jacobian at a displaced position; scratch for full pivoting
     G_of_S: Any  # (n_c + n_a, n_q) value of G for which S and W were computed, if M is constant; NaN: they are invalid
     pattern: Any  # (n_c + n_a, n_q) 1 for entries of the constraint Jacobian that have been nonzero in the run, else 0
     mass_pattern: Any  # (n_q, n_q) 1 for entries of M that have been nonzero, else 0; only in the form AUGMENTED
     row_entries: Any  # for each row of G, the index of its list in this array; then the lists: columns of its entries
-    Gamma_tried: Any  # (2, n_c + n_a) Gamma by finite differences with twice the time step, and with the last time step
+    Gamma_tried: Any  # (2, n_c + n_a) Gamma by finite differences with twice the time step, and with the one before it
     rates: Any  # (13, n_c + n_a) constraint rates C_t and b at 13 times within a step, see discontinuities.py
     changes: Any  # (N_CHANGES, n_q + n_c + n_a) samples of forces and constraint rates, see discontinuities.py
     Q: Any  # (n_q) generalized forces
     x: Any  # (n_q) scratch, for example a displaced position
     y: Any  # (n_q) scratch, for example a correction of positions
     C: Any  # (n_c) violations C(t, q) of the constraints; also scratch
-    Rate: Any  # (n_c + n_a) C_t = dC/dt at constant q, and b in A v + b = 0
+    Rate: Any  # (n_c + n_a) constraint rates: C_t = dC/dt at constant q, and b in A v + b = 0
     Gamma: Any  # (n_c + n_a) right-hand side of G a = Gamma for the accelerations a
     g: Any  # (n_c + n_a) scratch, with one entry for each row of G
     z: Any  # (r_v) scratch, with one entry for each independent row of G
-    lam: Any  # (n_c + n_a) multipliers that are computed, but not needed by the caller
+    lam: Any  # (n_c + n_a) multipliers of evaluations whose caller does not need them
     minimum: Any  # scratch for the multipliers of least norm, see saddle_point.py
     rows: Any  # (r) indices of the independent rows of C_q
     dependent: Any  # (r) indices of the dependent coordinates
@@ -105,11 +105,11 @@ class Work(NamedTuple):
     factors: Any  # entries of the factors of the augmented matrix, at the indices that f.ldl_program contains
     pivot_sizes: Any  # (n_q + n_c) squared norms of rows, to which the pivots are compared, see linalg/sparse_ldl.py
     unknowns: Any  # (n_q + n_c) right-hand side when a solver is called, solution when it returns
-    solutions: Any  # (3 (n_q + n_c)) scratch; then (n_c) factor s for each row g of C_q if s g^T g is added to M, or 0
+    solutions: Any  # (3 (n_q + n_c)) scratch; then (n_c) a number s for each row g of C_q: s g^T g is added to M
 
     sizes: Any = None  # the numbers that determine the sizes of all arrays, see `Sizes` in layout.py
-    address: Any = 0  # address of `table`
-    table: Any = None  # addresses and shapes of the arrays above, by which kernels receive them
+    address: Any = 0  # address of `table` in memory, which kernels receive as their argument `w`
+    table: Any = None  # addresses and shapes of the arrays above
 
 
 _INTEGER_FIELDS = {
@@ -150,7 +150,7 @@ class Attempt(NamedTuple):
 class Step(NamedTuple):
     """Compiled functions of a method: `attempt` computes a step; `commit` saves or discards its data in `memory`.
 
-    `many` computes several accepted steps in one call; None: the method has no such function.
+    `many` takes several steps in one call, and accepts or rejects them itself; None: the method has no such function.
     """
 
     attempt: Any = None
@@ -186,7 +186,7 @@ MANY = i8(KIT, WORK, *[VECTOR] * 5, f8, *[VECTOR] * 3, MATRIX, MATRIX)
 KIT.add_function("attempt_many", MANY)
 
 # signatures of the functions generated for a mechanism, see generate/elimination.py and collocation_code.py. Those with
-# a boolean result return False, and write no results, if a condition under which the code is valid does not hold
+# a boolean result return False, and write no results, if the code is not valid at this state, as pivots are too small
 OWN_FUNCTIONS = {
     # functions of a state: arguments (t, q, v, f.numbers), then arrays of results. own_accelerate stores accelerations;
     # own_correct_positions, the correction of q and the corrected q; own_project, accelerations, the correction of q,
@@ -238,7 +238,7 @@ def _imported_modules(text: str) -> set[str]:
 
 @cache
 def source_digest(module: str) -> str:
-    """Return a hash of all sources on which the machine code of a module depends; it changes if one of them changes.
+    """Return a hash of all sources on which the machine code of a module depends: part of its key in the cache on disk.
 
     These are the source of `module` (a name below twoloop.kernels, such as "steps.stages"), the sources of all modules
     that it imports, directly or not, and the signatures of callbacks.
@@ -290,31 +290,30 @@ OPTIONS: dict[str, Any] = {
 
 
 def _helper_decorator(**options: Any) -> Callable[[Callable[..., Any]], Dispatcher]:
-    """Return a decorator that compiles helpers: functions that compiled kernels call, and Python does not."""
+    """Return a decorator that compiles helpers: functions that only other compiled functions call."""
     wrappers = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
     return njit(**{**OPTIONS, **wrappers, "pipeline_class": HelperCompiler, **options})
 
 
-# numba passes the flags of a caller on to the functions that it calls. So forceinline is always set: else all helpers
-# that a merged helper calls would be merged, too
+# numba passes the flags of a function on to the functions that it calls. So each decorator sets forceinline: else all
+# helpers that a helper with forceinline=True calls would also be copied into their callers
 exact = _helper_decorator(fastmath=False, forceinline=False)  # keeps the order of floating-point operations
 compiled = _helper_decorator(forceinline=False)  # compiled as a function, which LLVM inlines only if it is short
 inlined = _helper_decorator(inline="always")  # inlined by numba; only a helper of this kind can return views of arrays
-# LLVM replaces each call by a copy of the code: for helpers that are short, or used in every evaluation
+# for helpers that are short, or used in every evaluation: LLVM replaces each call by a copy of the helper's code
 merged = _helper_decorator(forceinline=True)
 
 
-NO_NUMBERS = np.zeros(0)  # Kit.numbers if there are no generated functions that read data
+NO_NUMBERS = np.zeros(0)  # value of Kit.numbers if no generated function reads data
 
 
 class Kit:
     """Functions and data of a system and a method, passed to kernels as one reference.
 
-    `functions`: callbacks and data of the system. `step`: functions of the method; None: no kernel calls them. If the
-    run may switch between two methods, `first` and `second` are the functions of each. Kernels call all these functions
-    by their addresses, without compiling them again. `own`: functions generated for the mechanism, or (). `inner`: the
-    inner loop. It may call functions in `own`; tasks that these cannot do are done by `general`, the inner loop for any
-    mechanism. `numbers`: data that generated functions read; `own_numbers`: data for those of collocation.
+    `functions`: callbacks and data of the system. `inner`: the inner loop, which may call functions generated for the
+    mechanism (`own`; (): none). `general`: the inner loop for any mechanism, which does what these cannot do. `step`:
+    functions of the method; None: no kernel calls them. `first`, `second`: those of two methods between which the run
+    may switch. `numbers`, `own_numbers`: data for generated functions of a state, and for those of collocation.
     """
 
     def __init__(
@@ -351,7 +350,7 @@ def _type_of_kit(value: Any, context: Any) -> Any:
     return KIT
 
 
-# indices of callbacks in Functions; w.fault_kind is one of them, that of the callback that returned NaN or infinity
+# indices of callbacks in Functions; w.fault_kind contains the index of the callback that has returned NaN or infinity
 MASS, FORCE, CONSTRAINT, JACOBIAN, RATE, GAMMA = (
     Functions._fields.index(kind) for kind in ("mass", "force", "constraint", "jacobian", "constraint_rate", "gamma")
 )
@@ -362,7 +361,7 @@ NONHOLONOMIC, NONHOLONOMIC_RATE, NONHOLONOMIC_GAMMA = (
 
 @compiled
 def finite_vector(x):
-    """Return whether all entries of a vector are finite."""
+    """Return True if all entries of a vector are finite."""
     all_finite = True
     for j in range(x.size):
         all_finite = all_finite and np.isfinite(x[j])
@@ -371,7 +370,7 @@ def finite_vector(x):
 
 @compiled
 def finite(A):
-    """Return whether all entries of a matrix are finite."""
+    """Return True if all entries of a matrix are finite."""
     all_finite = True
     for i in range(A.shape[0]):
         all_finite = all_finite and finite_vector(A[i])
@@ -380,7 +379,7 @@ def finite(A):
 
 @compiled
 def not_finite(w, kind, t, q):
-    """Store t and the index `kind` of a callback with a NaN or infinite value (-1 if q has one); return NOT_FINITE."""
+    """Record in w that a callback (of index `kind`) or, as index -1, q is not finite at t; return NOT_FINITE."""
     w.fault_kind = kind if finite_vector(q) else -1.0
     w.fault_time = t
     return NOT_FINITE
@@ -388,7 +387,7 @@ def not_finite(w, kind, t, q):
 
 @compiled
 def faulty_callback(w):
-    """Return the index in Functions of a callback whose result in w is NaN or infinite; -1: none was found."""
+    """Return the index in Functions of a callback with a NaN or infinite result in w; -1: no such result is in w."""
     n_c = w.C.size
     if not finite_vector(w.Rate[:n_c]):
         return RATE
@@ -403,7 +402,7 @@ def faulty_callback(w):
     return FORCE if not finite_vector(w.Q) else -1
 
 
-GAP_SLACK = 1e-9  # a step may be longer than tolerances[GAP] by this fraction, which counts as a rounding error
+GAP_SLACK = 1e-9  # a step may exceed tolerances[GAP] by this fraction, which counts as a rounding error
 
 
 @merged
@@ -414,13 +413,13 @@ def allowed_error(tolerances, m, x, x1):
 
 @merged
 def is_beyond_gap(tolerances, h):
-    """Return whether a step of size h is longer than tolerances[GAP], the longest allowed time between evaluations."""
+    """Return True if a step of size h is longer than tolerances[GAP], the longest allowed time between evaluations."""
     return h > tolerances[GAP] * (1.0 + GAP_SLACK)
 
 
 @merged
 def gap_ratio(tolerances, h):
-    """Return h / tolerances[GAP] if a step of size h exceeds tolerances[GAP]; else, and for steps of fixed size, 0."""
+    """Return h / tolerances[GAP] if a step of size h must be rejected because it `is_beyond_gap`, else 0."""
     if tolerances[ESTIMATE] == 1.0 and is_beyond_gap(tolerances, h):
         return h / tolerances[GAP]
     return 0.0

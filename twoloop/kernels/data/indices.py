@@ -9,15 +9,15 @@ from twoloop.kernels.compile.callbacks import OPTIONAL_KINDS
 
 # codes that kernels return: DONE, or the reason why an evaluation or a step failed
 (
-    DONE,
-    OUTER_DIVERGED,
-    INNER_DIVERGED,
-    SINGULAR,
-    NOT_FINITE,
-    MASS_NOT_DEFINITE,
-    GAMMA_INACCURATE,
-    RANK_DIFFERS,
-    ROWS_CONTRADICT,
+    DONE,  # the evaluation or step has succeeded
+    OUTER_DIVERGED,  # the iteration for the stages of a step (outer loop) does not converge
+    INNER_DIVERGED,  # Newton's method for positions that satisfy the constraints (inner loop) does not converge
+    SINGULAR,  # the dependent columns of [C_q; A] or the equations for accelerations are singular
+    NOT_FINITE,  # a callback returned NaN or infinity
+    MASS_NOT_DEFINITE,  # the mass matrix is not positive definite
+    GAMMA_INACCURATE,  # finite differences do not yield Gamma as accurately as w.gamma_required
+    RANK_DIFFERS,  # the workspace was allocated for other ranks of C_q and [C_q; A] than w.rank and w.rank_v
+    ROWS_CONTRADICT,  # redundant constraints are violated: they contradict the others
     NEEDS_DENSE,  # the fixed-order form cannot decide which rows are independent: the caller uses a dense form
     NOT_LOADED,  # the machine code of the step is missing: the caller loads it, then repeats the call
     UNSUITED,  # the method does not suit the motion: the caller continues with another method
@@ -29,13 +29,13 @@ from twoloop.kernels.compile.callbacks import OPTIONAL_KINDS
     CONSTANT_MASS,  # 1: the mass matrix M is constant; 0: it varies
     DIAGONAL_MASS,  # 1: the mass matrix M is diagonal; 0: it may have other entries
     BANDWIDTH,  # bandwidth of the mass matrix if it is factored as a banded matrix; -1: it is not
-    FORM,  # form of the linear equations for accelerations: MULTIPLIERS, NULL_SPACE, AUGMENTED or FIXED_ORDER
+    FORM,  # algebra that solves for accelerations and multipliers: MULTIPLIERS, NULL_SPACE, AUGMENTED or FIXED_ORDER
     DENSE_FORM,  # value of FORM that replaces AUGMENTED if the sparse factors have too many entries
-    IS_GENERATED,  # 1: the inner loop is code generated for the mechanism; 0: it is the general one
+    IS_GENERATED,  # 1: the inner loop is code generated for the mechanism; 0: it is the one for any mechanism
     FIRST_GIVEN,  # index of the first flag of an optional callback, see GIVEN
 ) = range(7)
 MULTIPLIERS, NULL_SPACE, AUGMENTED, FIXED_ORDER = range(4)  # values of FORM, see saddle_point.py, sparse_inner_loop.py
-# index in Functions.flags for the name of each optional callback; the flag is 1 if the callback is given, else 0
+# by name of an optional callback: index in Functions.flags of its flag, 1 if the user gives this callback, else 0
 GIVEN = {name: index for index, name in enumerate(OPTIONAL_KINDS, FIRST_GIVEN)}
 N_FLAGS = FIRST_GIVEN + len(GIVEN)
 FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN, REACTION_BY_Q_GIVEN, MASS_VALUES_GIVEN = (
@@ -44,42 +44,43 @@ FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN, REACTION_BY_Q_GIVEN, MASS_VALUES_GIVEN = (
 
 # indices in Work.counters: numbers of steps, iterations, evaluations etc. since the start of the run
 (
-    N_ACCEPTED,
-    N_REJECTED_ERROR,
-    N_REJECTED_CONVERGENCE,
-    N_OUTER,  # number of iterations of the outer loop, which solves for the stages of implicit steps
+    N_ACCEPTED,  # number of accepted steps
+    N_REJECTED_ERROR,  # number of steps rejected because of their error
+    N_REJECTED_CONVERGENCE,  # number of steps that failed, for example because an iteration did not converge
+    N_OUTER,  # number of iterations of the outer loop, each of which evaluates all stages of a step
     N_INNER,  # number of iterations of the inner loop, which moves positions onto the constraints
-    N_EVALUATIONS,
-    N_PARTITIONS,
-    N_FACTORIZATIONS,
-    N_JACOBIANS,
+    N_EVALUATIONS,  # number of solutions of the equations for accelerations
+    N_PARTITIONS,  # number of choices of dependent coordinates (fixed-order form: of independent rows)
+    N_FACTORIZATIONS,  # number of factorizations of matrices
+    N_JACOBIANS,  # number of evaluations of the derivatives of accelerations, for Newton's method in the outer loop
     N_COUNTERS,
 ) = range(10)
 
 # indices in Work.notes: values that one kernel stores for another
 (
     SENSITIVITY,  # largest |dq_dependent / dq_independent| at this partition's first check, at least 1; 0: not checked
-    ORIENTATION,  # sign of det C_qd (dependent columns) at the last accepted state with this partition; 0: not known
+    ORIENTATION,  # sign of det C_qd (dependent columns of C_q) at the last accepted state of this partition; 0: unknown
     ORIENTATION_NEW,  # sign of det C_qd (dependent columns of C_q) at the end of the attempted step; 0: not known
     FAULT_KIND,  # index in Functions of a callback that returned NaN or infinity; -1: none known
-    FAULT_TIME,  # time (s) at which this callback returned NaN or infinity
+    FAULT_TIME,  # time (s) at which the callback FAULT_KIND returned NaN or infinity
     GAMMA_REQUIRED,  # allowed error of Gamma by finite differences (evaluation/constraints.py), relative to GAMMA_SCALE
     GAMMA_STEP_RATIO,  # time step of finite differences for Gamma, relative to the result of `largest_difference_step`
     GAMMA_ACCURACY,  # error of Gamma, relative to GAMMA_SCALE, when GAMMA_STEP_RATIO was chosen last
-    GAMMA_SCALE,  # size of Gamma, to which its errors are compared: largest |entry|, or sum of |terms| of G a, so far
+    GAMMA_SCALE,  # size to which errors of Gamma are compared: largest |entry| of Gamma, or sum of |G_ij a_j|, so far
     REUSE,  # after a correction of positions of at most this size, the Jacobian is not evaluated and factored again
-    ROUNDED,  # rounding error of positions; used instead of REUSE for states at the ends of steps
+    ROUNDED,  # rounding error of positions; replaces REUSE for states at the ends of steps
     GENERATION,  # number of partitions so far: a change of this number shows that the partition has changed
     RANK,  # rank of C_q, stored only if the workspace was allocated for another rank (code RANK_DIFFERS)
     RANK_V,  # rank of [C_q; A], stored together with RANK
     CONTRADICTION,  # with the code ROWS_CONTRADICT: index of a violated row of [C_q; A]
-    PIVOT,  # smallest pivot of C_q (rows scaled to norm 1) at the last full pivoting; small near a singular position
+    # smallest pivot of C_q, computed last (rows scaled to maxima of 1; fixed-order form: sine of an angle between rows)
+    PIVOT,
     # 1: the run has come near a singular position, or does not check for one; 2: near one, project stages; 0: else
     NEARLY_SINGULAR,
     NEAR_NOW,  # 1: a singular position was near at the last check; 2: the next check chooses a new partition; 0: else
     MASS_SCALE,  # factor by which M is multiplied in the augmented matrix, see linalg/saddle_point.py
     FACTORED,  # 1: the factors of the equations for accelerations belong to w.M and w.G; 0: M or G has changed since
-    HAS_GAMMA,  # 1: w.Rate and w.Gamma[:n_c] belong to the present state, by the callback `kinematics`; 0: else
+    HAS_GAMMA,  # 1: w.Rate and w.Gamma[:n_c] are those of the present state, from the callback `kinematics`; 0: else
     USED_GENERAL,  # 1: the general inner loop computed the last projected state; 0: generated code did
     EXPLICIT_STEP,  # 1: with a pair of methods (stiffness.py), the last attempted step was explicit; 0: else
     DEFECT,  # largest defect of accelerations in the attempted step, relative to the allowed defect; -1: not evaluated
@@ -88,7 +89,7 @@ FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN, REACTION_BY_Q_GIVEN, MASS_VALUES_GIVEN = (
     WIDEST_GAP,  # longest time (s) between two evaluations of the equations within accepted steps
     LAST_JUMP,  # time (s) of the last known jump of a constraint rate (C_t, b); -infinite: none
     NEXT_JUMP,  # time (s) of the next known jump of a constraint rate (C_t, b), or end of the run; infinite: unknown
-    # redundant rows are combinations of independent rows: largest |coefficient| at the last partition; 0: unknown
+    # largest |coefficient| of independent rows in a redundant row, at the first check of this partition; 0: unknown
     MAX_COEFFICIENT,
     SMALLEST,  # fixed-order form: smallest sine^2 of an angle between rows of C_q; negative: M is not positive definite
     TIME_IS_UP,  # 1 (set by another thread): the time limit has passed, and evaluations return STOPPED; 0: not yet
@@ -97,18 +98,18 @@ FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN, REACTION_BY_Q_GIVEN, MASS_VALUES_GIVEN = (
 
 
 def _group(first: str, end: str) -> dict[str, int]:
-    """Return {name in lower case: index} for the constants above from `first` to the last one before `end`."""
+    """Return {name in lower case: value} for the constants above from `first` to the last one before `end`."""
     names = list(globals())
     return {name.lower(): globals()[name] for name in names[names.index(first) : names.index(end)]}
 
 
-# names under which kernels read and write elements of these arrays, such as w.pivot, w.n_evaluations and f.form
+# by name of an attribute in kernels, such as w.pivot, w.n_evaluations and f.form: index of the element in its array
 NOTES, COUNTERS = _group("SENSITIVITY", "N_NOTES"), _group("N_ACCEPTED", "N_COUNTERS")
 FLAGS = _group("CONSTANT_MASS", "FIRST_GIVEN") | {f"{kind}_given": index for kind, index in GIVEN.items()}
 
 # indices in `tolerances`, an array that steps read: relative and absolute tolerances (eq. (26) of the paper) and limits
 (
-    RTOL,
+    RTOL,  # relative tolerance
     ESTIMATE,  # 1: steps estimate their errors; 0: they do not, because the step size is fixed
     LEAST,  # smallest tolerance of a coordinate or a velocity at the start of the run
     GAP,  # longest allowed time (s) between two evaluations of the equations
@@ -118,14 +119,14 @@ FLAGS = _group("CONSTANT_MASS", "FIRST_GIVEN") | {f"{kind}_given": index for kin
 MAX_GAP_RATIO = 0.01  # tolerances[GAP] (longest allowed time between two evaluations) / duration of the run
 REPORTED_ERROR = 30.0  # near a singular position, velocity errors above this number of tolerances are reported
 
-WINDOW = 4  # number of states that a polynomial of dense output interpolates
-# kinds of intervals between accepted states. The kind tells which data the polynomials of dense output interpolate
+WINDOW = 4  # number of accepted states that a polynomial of dense output interpolates
+# kinds of intervals between accepted states, which tell what the polynomials of dense output interpolate
 (
     SEPARATE,  # one polynomial interpolates q and v, and yields q; another interpolates v and a, and yields v
     VELOCITIES,  # one polynomial interpolates q and v, but not the accelerations a, which contain noise of stiff modes
     ACCELERATIONS,  # one polynomial interpolates q, v and a
     ACROSS,  # same as ACCELERATIONS, for a step across a singular position
-    JUMP,  # no polynomial: velocities jump in the interval, which is only a few floating-point numbers long
+    JUMP,  # no polynomial: velocities jump in the interval, which is only a few spacings of floating-point times long
 ) = range(5)
 # columns of the table of intervals, which has one row for each interval that contains output times
 (
