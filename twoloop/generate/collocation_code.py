@@ -114,7 +114,7 @@ def _integrals(coefficients: Extended, z: Extended) -> tuple[Extended, Extended,
     points z are on [-1, 1]; integrals are over the time (z + 1) / 2, and begin at 0.
     """
     values = _legendre(z)
-    # the integral of P_k over z from -1 is (P_k+1 - P_k-1) / (2 k + 1), or P_1 + 1 if k = 0; `double`: same rule
+    # integral of P_k over z from -1: (P_k+1 - P_k-1) / (2 k + 1), or P_1 + 1 if k = 0; the same rule yields `double`
     single = np.array([values[1] + 1, *((values[k + 1] - values[k - 1]) / (2 * k + 1) for k in range(1, N + 1))])
     double = np.array([single[1] + single[0], *((single[k + 1] - single[k - 1]) / (2 * k + 1) for k in range(1, N))])
     return coefficients.T @ values[:N], coefficients.T @ single[:N] / 2, coefficients.T @ double / 4
@@ -465,7 +465,7 @@ class CollocationCode:
             v0, a0 = (num.load(num.pointer(state, i), m * self.n) for m in (1, 2))
             of_v = self._weighted_accelerations(emit, tables().velocities, a0, work, i)
             store_lanes(emit, emit.fma(h, of_v, emit.broadcast(v0)), num.pointer(work, k * LANES), self.spectrum_offset)
-        offset.add_incoming(integer(self.spectrum_offset), builder.block)  # then load those just stored
+        offset.add_incoming(integer(self.spectrum_offset), builder.block)  # second pass: velocities from here
         builder.jump(loop)
         builder.position_at_end(after)
 
@@ -688,7 +688,7 @@ class CollocationCode:
         store_lanes(emit, emit.builder.select(is_valid, before, emit.constant(0.0)), work, mem.VALID)
 
     def _integrate(self, emit: LaneEmitter, work: Value, state: Value) -> Value:
-        """Write code that integrates accelerations to v and q at the nodes; return the largest change of v * weight."""
+        """Write code that integrates accelerations to v and q at the nodes; return max |change of v| / tolerance."""
         num = Emitter(emit.builder)
         with loop_over_coordinates(emit, self.iterated_coordinates, [emit.constant(0.0)]) as (k, i, (largest,), new):
             before = load_lanes(emit, num.pointer(work, k * LANES), self.v_offset)
@@ -703,7 +703,7 @@ class CollocationCode:
     def _store_stages(
         self, emit: LaneEmitter, work: Value, state: Value, k: Value, i: Value, sums: Sequence[Value]
     ) -> Value:
-        """Write code for v and q of the k-th iterated coordinate, i, by the integrals `sums` of its a; return v."""
+        """Write code for v and q of the k-th iterated coordinate, i; return v. `sums`: integrals of accelerations."""
         num = Emitter(emit.builder)
         h = emit.broadcast(num.load(work, mem.H))
         index, begin = num.pointer(work, k * LANES), num.pointer(state, i)

@@ -39,7 +39,7 @@ DOUBLE_POINTER = f"{DOUBLE}*"
 # generated code is not used if the relative error of its accelerations near the start is larger. This is checked only
 # if rows of G are added to M, or solutions are refined (see PivotChoice). During runs, the error grew up to 200 times
 LARGEST_LOSS = 1e-8
-MAX_POSITIONS, SPACING = 4, 0.02  # the error is measured at one of these positions, with this spacing (m or rad)
+MAX_POSITIONS, SPACING = 4, 0.02  # largest number of positions tried to measure this error; their spacing (m or rad)
 
 
 def write_accelerations(

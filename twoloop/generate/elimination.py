@@ -257,8 +257,8 @@ def _scale_factors(singular: Sequence[int], mass: Array, G: Array) -> Array:
 
     Without the factor, a row on Euler parameters alone, such as their norm, would hide the small inertia of a body
     beside heavy bodies. `singular`: rows that are added because M is singular. The factor is a negative power of
-    SCALE_STEP if M is small in all columns in which g has entries, and each of these columns has an entry in one of the
-    rows `singular`. Otherwise it is 1.
+    SCALE_STEP if M is small in all columns in which g has nonzero entries, and the rows `singular` have nonzero entries
+    in all these columns, too. Otherwise it is 1.
     """
     rows, covered = np.abs(G), np.any(G[list(singular)], axis=0)
     has_entry = rows > 0.0
@@ -405,7 +405,7 @@ class Elimination:
 
     @property
     def accelerations(self) -> list[Program]:
-        """Return the programs for accelerations, in order: `reduced_program` (if it exists), `mass_first_program`."""
+        """Return the programs for accelerations: `reduced_program` (shorter) if it exists, and `mass_first_program`."""
         return (
             [self.mass_first_program]
             if self.reduced_program is None
@@ -420,7 +420,7 @@ class Elimination:
         return Program(self.graph, {"r": force, "c": [x if k in used else self.zero for k, x in enumerate(gamma)]})
 
     def _accelerations(self, v: Sequence[Affine]) -> tuple[list[Affine], list[tuple[Affine, Affine]]]:
-        """Return a list of the accelerations at velocities v and multipliers of independent rows, and conditions."""
+        """Return accelerations at velocities v and multipliers of independent rows in one list; conditions for them."""
         return self._solve(*self._right_sides(v))
 
     def _expand_to_all_rows(self, independent: Sequence[Affine]) -> list[Affine]:

@@ -227,7 +227,10 @@ class LaneSteps:
         return None
 
     def accept_or_reject(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Write code that stores ACCEPTED, LONGEST (largest next step size), and RUNNING = 0 if a run has to stop."""
+        """Write code that accepts steps (ACCEPTED = 1) or rejects them, and stores the largest next size, LONGEST.
+
+        After too many rejections or a value that is not finite, a run leaves its lane: RUNNING = 0.
+        """
         builder, one = emit.builder, emit.constant(1.0)
         select, per_order = builder.select, one / emit.to_double(order)
         off, *defects = (emit.load(work, field) for field in (lanes.PREDICTION_ERROR, lanes.WORST_DEFECT, lanes.DEFECT))

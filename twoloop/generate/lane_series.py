@@ -490,7 +490,7 @@ class _Row:
 class _PartialSums(NamedTuple):
     """Sums of X[j] Y[k - j] over 1 < j < k, and the rows needed to add the terms j = 1 and j = k, which are missing."""
 
-    sums: dict[tuple[tuple[int, int], bool], Value]  # keys: ((index of X, index of Y), True for Y[k + 1 - j])
+    sums: dict[tuple[tuple[int, int], bool], Value]  # keys: ((X, Y), True: for order k + 1); X, Y: indices of factors
     first_row: Value  # pointer to the row of order 1; if k is 1, to a row of zeros: products with it are then 0
     row_1: Value  # pointer to the row of order 1
     row_before: _Row  # row of order k - 1
