@@ -71,7 +71,10 @@ class Factors:
             self.blocks.append(Block(row_indices, inverse, rows_below))
 
     def _inverse(self, pivots: list[list[Affine]], own_pivots: list[Any]) -> list[list[Affine]]:
-        """Return the inverse of the block `pivots`. `own_pivots`: pivots if G had no other rows; None: no condition."""
+        """Return the inverse of a 1x1 or 2x2 pivot block, and append its pivots to `mass_pivots` or `conditions`.
+
+        `own_pivots`: for each row of the block, its pivot if G had no other rows; None: the row needs no condition.
+        """
         diagonal = [None if pivot is None else pivot.as_term() for pivot in own_pivots]
         a = pivots[0][0]
         if diagonal[0] is None:
@@ -178,7 +181,7 @@ def _order_rows(rows: list[dict[int, Affine]], n: int, pairs: Sequence[tuple[int
 
 
 def _eliminate(neighbours: list[set[int]], rows: Sequence[int]) -> set[int]:
-    """Update the graph of nonzero entries for an elimination of `rows`: connect their neighbours; return these."""
+    """Update `neighbours` as the elimination of `rows` does: connect their neighbours, and return these."""
     new_neighbours = set().union(*(neighbours[i] for i in rows)) - set(rows)
     for j in new_neighbours:
         neighbours[j] = (neighbours[j] | new_neighbours) - {*rows, j}
@@ -297,7 +300,7 @@ class DependentCoordinates:
             self.conditions.append((pivot * pivot, (a * b).times(MIN_PIVOT_SQUARE)))
 
     def _substitute(self, j: int, row: Terms) -> None:
-        """Store T[j] and g[j] for a dependent coordinate j; a[j] = row[n_q] - sum of row[k] a[k] over k < n_q."""
+        """Store T[j] and g[j] of a dependent coordinate, given its equation a[j] = row[n_q] - sum of row[k] a[k]."""
         self.check_length()
         rhs, entries = row.get(self._n, self._zero), dict[int, Affine]()
         for k, entry in row.items():
@@ -335,7 +338,7 @@ def solve_reduced_system(
 
 
 def _pivot_conditions(matrix: dict[tuple[int, int], Affine], factors: Factors) -> Iterator[tuple[Affine, Affine]]:
-    """Yield conditions: each pivot of T^T M T (`matrix`) must exceed a small fraction of the diagonal entry."""
+    """Yield pairs (pivot, small fraction of diagonal entry) of T^T M T (`matrix`): the first must be larger."""
     pivots = iter(factors.mass_pivots)
     for row_indices, _, _ in factors.blocks:
         first_pivot: Affine | None = None

@@ -23,10 +23,10 @@ MAX_TERMS = 200  # a callback is not traced if it adds up more terms with parame
 _as_float = float.__pos__  # converts a Parameter to a float; float(x) raises an exception while callbacks are traced
 # two terms cancel if their sum is at most this fraction of the second term
 CANCELLATION_LIMIT = 8.0 * 2.0**-52
-NUMBER_TYPES = (int, float, np.number)  # a Parameter is a float
+NUMBER_TYPES = (int, float, np.number)  # types that count as numbers; Parameter is a subclass of float
 _UNARY_FUNCTIONS = ("sin", "cos", "tan", "sqrt", "exp", "log", "arctan", "sinh", "cosh", "tanh", "absolute")
 FUNCTIONS = {name: getattr(np, name) for name in (*_UNARY_FUNCTIONS, "hypot", "power")}
-OPERATORS: dict[str, Callable[..., Any]] = {  # keys: names in NumPy; values: functions by Python's operators
+OPERATORS: dict[str, Callable[..., Any]] = {  # keys: names in NumPy; values: the same functions by Python's operators
     "add": operator.add,
     "subtract": operator.sub,
     "multiply": operator.mul,
@@ -98,14 +98,14 @@ class ParameterTape(SymbolicObject):
             self.parameters[i] = Parameter(float(values[i]), self, 1.0, ((i, 1.0),))
 
     def atom(self, definition: Any) -> Powers:
-        """Return an atom as Powers; create it if new. `definition`: ("sum", terms) or (function name, arguments)."""
+        """Return the atom with a definition ("sum", terms) or (function name, arguments), as Powers."""
         if definition not in self._atom_indices:
             self._atom_indices[definition] = len(self.atoms)
             self.atoms.append(definition)
         return ((self._atom_indices[definition], 1.0),)
 
     def terms(self, number: float) -> dict[Powers, float]:
-        """Return the terms whose sum is `number`; keys: products of powers of atoms; values: their coefficients."""
+        """Return the terms whose sum is `number`; keys: products of powers; values: their coefficients."""
         if type(number) is not Parameter:
             return {(): number} if number else {}
         (i, exponent), *other_powers = number.powers

@@ -1,4 +1,4 @@
-"""Programs: lists of operations of a graph of traced callbacks, and arrays of affine expressions of their results.
+"""Programs: operations of traced callbacks, recorded in a graph, and arrays of affine expressions of their results.
 
 - `Program.run` executes a program in an algebra, which defines what a value is: an array of numbers (`ArrayAlgebra`), a
   value in generated code (`llvm_code.Lowering`), or a polynomial degree (`time_dependence.DegreeAlgebra`).
@@ -96,7 +96,7 @@ class Program:
         return algebra.run_program(self)
 
     def quantities(self, available: Container[int] = ()) -> list[int]:
-        """Return the indices of quantities to compute for the arrays and conditions if those in `available` exist."""
+        """Return the indices of quantities to compute for the arrays and conditions if `available` ones are known."""
         return self.graph.quantities_for(self.expressions, available)
 
     def cost(self) -> int:
@@ -212,7 +212,7 @@ class OperationTable(NamedTuple):
         return [float(x) for part in parts for x in part]
 
     def as_arrays(self, result_indices: Sequence[int]) -> tuple[Any, Any]:
-        """Return integers and floats for a derived callback; `result_indices`: index of each result in its output."""
+        """Return the table as integers and floats for a derived callback; `result_indices`: indices in its output."""
         rows, n = self.rows.copy(), len(result_indices)
         rows[rows[:, KIND] == RESULT, NODE] += self.n_nodes
         header = [self.n_nodes + n, len(rows), len(self.columns), n]
@@ -231,7 +231,7 @@ LITERAL_TOLERANCE = 8.0 * 2.0**-52  # largest difference between a coefficient a
 
 
 class Coefficient(float):
-    """Coefficient that generated code reads from an array; only the same object is equal, whatever the values.
+    """Coefficient that generated code reads from an array; it is equal only to itself, even if values are equal.
 
     `index`: index in the array. `varies`: whether this is the array of coefficients that vary with parameters.
     """
@@ -257,7 +257,7 @@ class Coefficient(float):
 
 
 class Coefficients:
-    """Indices, in arrays that generated code reads, of the coefficients of expressions, in the order of first use.
+    """Numbering of the coefficients of expressions: their indices in arrays that generated code reads.
 
     Equal expressions share coefficients. If `separate_varying`, the coefficients that vary with parameters have a
     second array with indices of its own, because their values differ between SIMD lanes.
@@ -278,7 +278,7 @@ class Coefficients:
 
     @property
     def formulas(self) -> Any:
-        """Return the same coefficients, as floats or Parameters; the same array object if no coefficient was added."""
+        """Return the coefficients as floats or Parameters; the array object changes only if a coefficient is added."""
         if len(self._formulas) != len(self._values):
             self._formulas = number_array(self._values)
         return self._formulas

@@ -38,9 +38,9 @@ class Sums(NamedTuple):
     column: Integers  # for each expression, the index of the quantity in its first term
     coefficient: Array  # for each expression, the coefficient of its first term
     constant: Array  # for each expression, its constant
-    row: Integers  # for each term that is not the first, the index of its expression, or of the equation it belongs to
-    further_column: Integers  # for each such term, the index of its quantity
-    further_coefficient: Array  # for each such term, its coefficient
+    row: Integers  # for each further term, the index of its expression (in `rows` and `balance`: of the equation)
+    further_column: Integers  # for each further term (not the first one of an expression), the index of its quantity
+    further_coefficient: Array  # for each further term, its coefficient
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ class SeriesProgram:
         return len(self.early.first.column) + len(self.late.first.column)
 
     def specialize(self, system: ConstrainedSystem, evaluate: Evaluator) -> "SeriesProgram":
-        """Return a copy of the program with coefficients for the parameters of one system."""
+        """Return a copy of the program for one system; `evaluate` computes coefficients for its parameters."""
 
         def specialized(exprs: Sums) -> Sums:
             coefficient, constant = evaluate(exprs.coefficient), evaluate(exprs.constant)
@@ -104,7 +104,7 @@ class SeriesProgram:
 
     @property
     def kinds(self) -> frozenset[str]:
-        """Return the kinds of callbacks that were traced."""
+        """Return the names of the callbacks that were traced."""
         return frozenset() if self.traced is None else self.traced.kinds
 
     @property
@@ -198,7 +198,7 @@ def _sum_of_products(
 
     There are two ways: (1) terms with equal factors share a product; (2) each factor is split into its quantities, and
     terms with the same quantity share a product. The way with fewer new products is taken. If both have as many, it is
-    (2) if `of_rates` (for G v + (C_t, b)), else (1): (2) may yield (cos x) x', which costs nothing, see lane_series.py.
+    (2) if `of_rates` (for G v + (C_t, b)), else (1): (2) may yield (cos x) x', the rate of sin x, which costs nothing.
     """
     total = rest
     by_factor: dict[Any, tuple[Affine, Affine]] = {}
@@ -304,12 +304,11 @@ def _nonzero_sums(exprs: list[Affine], nodes: dict[int, int]) -> tuple[Sums, Int
 
 
 def _remove_terms(expr: Affine, inputs: Container[int]) -> Affine:
-    """Return an expression without its terms in the quantities `inputs`."""
     return Affine(expr.graph, expr.constant, {i: c for i, c in expr.terms.items() if i not in inputs})
 
 
 def _grouped_operations(operations: list[Any]) -> list[tuple[int, list[Any]]]:
-    """Sort operations into groups of one kind, which depend on earlier groups only; return (kind, operations) each."""
+    """Sort operations into groups of one kind that depend on earlier groups only; return pairs (kind, operations)."""
     nodes = {node for node, *_ in operations}
     levels: dict[int, int] = {}
     groups: dict[tuple[int, int], list[Any]] = {}

@@ -53,7 +53,7 @@ class Dependence(NamedTuple):
 
     short_forces: ShortForces
     is_steep: bool  # whether forces or drives may vary much over a distance shorter than a step
-    kinds: frozenset[str]  # kinds of callbacks that were traced
+    kinds: frozenset[str]  # names of the callbacks that were traced
 
     def specialize(self, system: ConstrainedSystem, evaluate: Evaluator) -> "Dependence":
         """Return this object: the result does not depend on parameters."""
@@ -114,7 +114,7 @@ def _make_analysis(system: ConstrainedSystem) -> Any:
 
 
 class DegreeAlgebra(Algebra[float]):
-    """Algebra whose values are degrees of quantities as polynomials in `inputs`; sin x, 1 / x, ... count as x."""
+    """Algebra whose values are degrees as polynomials in `inputs`; sin x, 1 / x, ... have the degree of x."""
 
     functions: Mapping[int, Callable[[float], float]] = MappingProxyType(
         {
@@ -153,7 +153,7 @@ class GrowthExponents(DegreeAlgebra):
 
 
 class DivisorDegrees(DegreeAlgebra):
-    """Algebra whose values are total degrees of divisors: a product has the sum, an affine expression the largest.
+    """Algebra whose values are total degrees of divisors: the sum of the factors', or the largest of the terms'.
 
     `degrees`: degrees of all quantities. Arguments of arctangents count, too: derivatives of arctangents are quotients.
     """
@@ -183,7 +183,6 @@ class DerivativeBounds(DegreeAlgebra):
 
 
 def _has_time_pulses(graph: Graph, quantities: list[int]) -> bool:
-    """Return whether one of the `quantities` may have short pulses as a function of time."""
     dependent = [i for i in quantities if graph.input_masks[i] & TIME_MASK]
     degrees = DegreeAlgebra([0])  # degrees as polynomials in input 0 (time), or in its sines and cosines
     degrees.run(graph, dependent)
@@ -191,7 +190,6 @@ def _has_time_pulses(graph: Graph, quantities: list[int]) -> bool:
 
 
 def _has_state_pulses(graph: Graph, quantities: list[int], n_q: int) -> bool:
-    """Return whether one of the `quantities` may have short pulses as a function of q or v."""
     dependent = [i for i in quantities if graph.input_masks[i] & ~TIME_MASK]
     inputs = range(1, 2 * n_q + 1)
     degrees, vibrations, growth = DegreeAlgebra(inputs), TrigonometricDegrees(), GrowthExponents(inputs)

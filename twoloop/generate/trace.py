@@ -81,7 +81,7 @@ def trace(function: Callable[..., Any], t: Affine, *arguments: Any) -> Any:
 
 
 def convert_to_expressions(graph: Graph, values: Any) -> Any:
-    """Convert the entries of an array, which a callback filled or returned, to expressions in place; return it."""
+    """Convert the entries of an array, which a callback filled or returned, to expressions; return the array."""
     for index in np.ndindex(values.shape):
         entry = values[index]
         if type(entry) is not Affine:
@@ -101,7 +101,7 @@ class _CallbackCopier(FunctionCopier):
         return isinstance(value, Dispatcher | types.FunctionType)
 
     def callback(self, function: Any) -> Any:
-        """Return a copy of a callback: a function, or an object with a method `__call__`."""
+        """Return a copy, for a trace, of a callback: of a function, or of an object with a method `__call__`."""
         method = next((vars(each)["__call__"] for each in type(function).__mro__ if "__call__" in vars(each)), None)
         if isinstance(method, types.FunctionType) and not isinstance(function, Dispatcher):
             return types.MethodType(self.replacement_of(method), function)
@@ -158,7 +158,7 @@ def _refuse_symbols(value: Any, verb: str) -> None:
 
 
 def _numeric_function(function_of_numbers: Any, name: str) -> Callable[..., Any]:
-    """Return a copy of a function that refuses symbols as arguments; `name`: name of the function in the message."""
+    """Return a function that refuses symbols, and calls `function_of_numbers` otherwise; `name`: for the message."""
 
     @functools.wraps(function_of_numbers)
     def call_with_numbers(*arguments: Any, **options: Any) -> Any:
@@ -328,7 +328,7 @@ class Equations:
         return self._gamma(*GAMMA_SOURCES[kind], self.v if v is None else v)
 
     def _derive_or_trace(self, kind: str, v: Sequence[Affine]) -> Any:
-        """Compute the result of `expressions`, as derivatives, or as a trace (of a copied object, if it has one)."""
+        """Return C_q or gamma as derivatives if the system has no callback for it; otherwise, the callback's trace."""
         if self._is_derived(kind):
             return self.derivatives(kind, v)
         if kind in self._results_before_copy and v is self.v:
@@ -467,7 +467,7 @@ class TraceCache:
         return self._tape.product_evaluator(self.magnitudes(parameters))
 
     def evaluator(self, parameters: Array) -> Evaluator:
-        """Return a function that evaluates arrays of expressions for `parameters`; these arrays must not change."""
+        """Return a function that evaluates arrays of expressions, which must not change later, for `parameters`."""
         product = self.product_evaluator(parameters)
 
         def evaluate(array: Any) -> Array:
@@ -476,7 +476,7 @@ class TraceCache:
             scales, indices, products = self._scaled_products(array)
             with np.errstate(all="ignore"):
                 values: Array = scales * np.array(list(map(product, products)))[indices]
-            if not np.isfinite(values).all():  # for example if a sum of parameters is zero, and a divisor
+            if not np.isfinite(values).all():  # for example by division by a sum of parameters that is 0
                 raise Untraceable("a number of them is not finite for these parameters")
             return values
 
@@ -530,7 +530,7 @@ def derive_cached(
 
 
 def _derive_shared(system: ConstrainedSystem, cache: TraceCache, key: Any, make: Callable[[TraceCache], Any]) -> Any:
-    """Return the result of make(cache) with the coefficients of `system`; if this fails, return the Untraceable."""
+    """Return the result of make(cache) with the coefficients of `system`; if this fails, return an Untraceable."""
     try:
         result = cache.remembered(key, partial(make, cache))
         return result.specialize(
@@ -561,7 +561,7 @@ def shared_cache(system: ConstrainedSystem) -> TraceCache:
 
 
 def trace_cache_of(system: ConstrainedSystem) -> TraceCache:
-    """Return the TraceCache of all systems with the same compiled callbacks, sizes and classes of parameters."""
+    """Return the TraceCache of all systems with the same compiled callbacks, sizes and classes (see TraceCache)."""
     parameters = system.parameters
     classes = _parameter_classes(parameters)
     fixed_parameters = parameters[classes == 0] + 0.0  # -0.0 becomes 0.0, so that keys with zeros are equal
@@ -578,7 +578,7 @@ def _own_cache(system: ConstrainedSystem) -> TraceCache:
 
 
 def _parameter_classes(parameters: Array) -> NDArray[np.int64]:
-    """Return the class of each parameter, see `TraceCache`; classes are numbered in the order of first use."""
+    """Return the class of each parameter, see `TraceCache`; classes have numbers in the order of `parameters`."""
     magnitudes = np.abs(parameters)
     varies = (magnitudes > MIN_MAGNITUDE) & (magnitudes < 1.0 / MIN_MAGNITUDE) & (magnitudes != np.floor(magnitudes))
     _, first, inverse = np.unique(magnitudes[varies], return_index=True, return_inverse=True)

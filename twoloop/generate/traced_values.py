@@ -32,9 +32,9 @@ KINDS = (
 N_NEARBY = 8  # before a run, calls and traces are compared at the start and at this number of random states near it
 RELATIVE_TIMES = np.linspace(0.0, 1.0, N_NEARBY)  # times of the random states, from 0 (start of the run) to 1 (its end)
 NEARBY_DISTANCE = 0.3  # largest distance of a random position from the start, relative to the sizes of the coordinates
-# largest numbers of states, about: that a `Sample` takes from one chunk of steps; that are compared after a run (also
-# largest number of chunks in a `Sample`); that are compared if callbacks are called in Python
-MAX_STATES_OF_CHUNK, MAX_STATES, MAX_STATES_IN_PYTHON = 32, 64, 9
+MAX_STATES_OF_CHUNK = 32  # a `Sample` takes at most about this number of states from one chunk of steps
+MAX_STATES = 64  # about the largest number of states at which traces are compared; largest number of chunks in `Sample`
+MAX_STATES_IN_PYTHON = 9  # the same as MAX_STATES, for comparisons with callbacks that are called in Python
 MAX_ENTRIES = 20_000  # about the largest number of entries that are compared: for large systems, fewer states suffice
 # limits of the difference between call and trace, relative to the largest term that the trace adds up in any entry of
 # the callback's result. Up to ROUNDING_DIFFERENCE, it is a rounding error; above CLEAR_DIFFERENCE, the trace is wrong;
@@ -43,8 +43,8 @@ ROUNDING_DIFFERENCE = 16.0 * np.finfo(float).eps
 CLEAR_DIFFERENCE = 1e-6
 # `_is_systematic` compares call and trace at N_NEIGHBOURS states, whose relative distance is at most PERTURBATION
 PERTURBATION, N_NEIGHBOURS = 1e-7, 12
-MARGIN = 0.01  # a CheckedRegion extends the range of checked states by this fraction; most steps move further
-MARGIN_AT_REST = 1e-9  # the region is also extended by this fraction of the largest range, for coordinates at rest
+MARGIN = 0.01  # a CheckedRegion extends the range of checked states by this fraction, which is less than most steps
+MARGIN_AT_REST = 1e-9  # it also extends all ranges by this fraction of the largest: coordinates at rest have range 0
 
 
 class CallbackTraces:
@@ -178,7 +178,7 @@ class Sample:
         self.add(state[:0], state[None, :][:0], t, state)
 
     def add(self, t: Array, rows: Array, end: float, state: Array) -> None:
-        """Add states of successive steps: `rows` [q, v, ...] at times `t` (of many, every k-th); `state` at `end`."""
+        """Add states of successive steps, or every k-th of many: `rows` [q, v, ...] at times `t`, `state` at `end`."""
         stride = 1 + len(t) // MAX_STATES_OF_CHUNK
         times = t[::stride]
         states = np.empty((len(times) + 1, 1 + self._n))

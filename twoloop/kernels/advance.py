@@ -61,7 +61,7 @@ from twoloop.kernels.linalg.dense import copy
 
 SUDDEN_ERROR = 10.0  # a force is assumed to jump within a rejected step whose error, in tolerances, exceeds this
 MAX_RATIO_AFTER_REJECTION = 0.95  # the next step size is at most this times the size of a rejected step
-FIRST_JUDGED_STEP = 2  # a trial may end because a step is short, but not before this step: the first size is a guess
+FIRST_JUDGED_STEP = 2  # in a trial of a method, sizes of steps count from this accepted step on: the first is a guess
 
 
 @kernel(i8(KIT, WORK, f8, VECTOR))
@@ -77,7 +77,7 @@ def start(f, w, t, state):
         code = find_tangents(f, w, t, q)
     if code == DONE:
         code = accelerations(f, w, t, q, v, state[2 * n : 3 * n], state[3 * n :])
-    # finite differences yield Gamma with an error relative to its size, which is known now: compute it again
+    # finite differences yield Gamma with an error relative to its size, which is known only now: compute it again
     if code == DONE and f.gamma_given == 0:
         code = accelerations(f, w, t, q, v, state[2 * n : 3 * n], state[3 * n :])
     return code
@@ -85,7 +85,7 @@ def start(f, w, t, state):
 
 @merged
 def _locate_rate_jump(f, w, t, size, tolerances, accepted, state, new_state):
-    """Return how C_t and b change in a step (SMOOTH, RAMP: steep, or JUMP), and two times (s): ends of ramp or jump."""
+    """Return SMOOTH, RAMP (steep) or JUMP, for C_t and b in a step, and two times (s): ends of the ramp or jump."""
     n = w.Q.size
     q, v = state[:n], state[n : 2 * n]
     if not accepted:

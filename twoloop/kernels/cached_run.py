@@ -191,7 +191,7 @@ RUN_ARRAYS.add_function("advance", i8(KIT, WORK, *(VECTOR,) * 9, MATRIX, MATRIX,
     REUSE,  # after a smaller correction of positions, the inner loop keeps C_q: initial w.reuse
     NEARLY_SINGULAR,  # initial w.nearly_singular: 1 if the method does not check within steps for singular positions
     HAS_ALL_ENTRIES,  # 1: the array `kinds` shows all entries of G that may be nonzero; 0: search for them at the start
-    RANK_LIMIT,  # a row of G with a smaller relative pivot counts as dependent on other rows
+    RANK_LIMIT,  # a row of G is redundant if less than this fraction of it is orthogonal to other rows
     WEAK_LIMIT,  # M counts as singular if the ratio of its smallest to its largest eigenvalue is below this
     ADDED_SCALE,  # factor s: for a singular M, generated code uses M + s g^T g instead, where g are some rows of G
     CONTRADICTS,  # a start is refused if a row of G a = gamma has a larger residual, relative to the sum of |terms|
@@ -208,7 +208,7 @@ RUN_ARRAYS.add_function("advance", i8(KIT, WORK, *(VECTOR,) * 9, MATRIX, MATRIX,
 ) = range(18)
 # indices in `expected`, the choice of constraint rows for which code was generated (empty without generated code)
 (
-    BOUND,  # result that `choose` returns for this choice; OF_PYTHON: only Python can make the choice
+    BOUND,  # index of the smallest accepted pivot, which `choose` returns; OF_PYTHON: only Python can make the choice
     N_ROWS,  # number of independent rows
     N_ADDED,  # number of rows g that are added to a singular M as s g^T g
     FIRST_ROW,  # begin of two lists, one after the other: indices of the independent rows, and of the added rows
@@ -327,9 +327,9 @@ def _restore_start(b):
     copy(b.saved_integers, b.lasting_integers)
 
 
-N_EQUAL = 0  # index in `last_start` of the number of successive runs from the last start, at most 2
-START = 1  # index in `last_start` at which the last start, [t, t1, q, v], begins
-NEVER, IS_SAVED = 0.0, 2.0  # values of last_start[N_EQUAL]: no run could begin there; its data have been saved
+N_EQUAL = 0  # last_start[N_EQUAL]: number of successive runs from the last start, counted up to 2
+START = 1  # last_start[START:]: the last start, [t, t1, q, v], where t1 is the end of the run
+NEVER, IS_SAVED = 0.0, 2.0  # values of last_start[N_EQUAL]: no run could begin there; data of this start are in `saved`
 
 
 @exact

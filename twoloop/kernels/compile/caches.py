@@ -409,7 +409,7 @@ def digests_of(function: Callable[..., Any]) -> tuple[str, str] | None:
 def _digests_and_helpers(function: Callable[..., Any]) -> tuple[tuple[str, str] | None, list[Any]]:
     """Return the result of `digests_of`, and the helpers of a function; each comes after the helpers that it calls."""
     code, closure = Digest(), Digest()
-    closure.names = reachable_names(function)  # for a value that is a module, attributes with these names count
+    closure.names = reachable_names(function)  # if a value is a module, its attributes with these names are hashed
     try:
         code.add_function(function, enclosed=False)
         closure.add(closure_values(function))
@@ -432,7 +432,7 @@ def helper(function: Callable[..., Any]) -> Any:
     return dispatcher
 
 
-# digests that functions called by callbacks had when they were compiled last
+# keys: compiled functions that callbacks call; values: their digests when they were compiled
 _COMPILED_DIGESTS: WeakKeyDictionary[Any, tuple[str, str]] = WeakKeyDictionary()
 
 

@@ -39,7 +39,7 @@ SAFE_CALLS = ("len", "min", "max", "abs", "range", "enumerate", "zip", "reversed
 
 
 def add_bounds_checks(function: Callable[..., Any]) -> tuple[Callable[..., Any], dict[str, Any]]:
-    """Return the function to compile in place of a callback, and the options of numba, for checks of its indices.
+    """Return the function to compile for a callback, and options of numba, so that its indices are checked.
 
     The options are empty if no index is computed. If a compiled function that the callback calls (a helper) computes
     indices, the returned function is a copy of the callback that calls copies of all helpers with checks.
@@ -51,7 +51,7 @@ def add_bounds_checks(function: Callable[..., Any]) -> tuple[Callable[..., Any],
 
 
 def _compile_with_bounds_checks(copy: Any, original: Any) -> Any:
-    """Return `copy`, compiled with checks of its indices if `original`, from which it is made, is compiled."""
+    """Return a copied function; if the `original` is compiled, compile the copy with checks of its indices."""
     helper = python_function(original)
     if helper is None:
         return copy
@@ -377,8 +377,7 @@ def compile_callback(
 ) -> Dispatcher:
     """Compile a function as a callback of the given kind; raise TypeError if this is impossible.
 
-    `digests`: see `compile_cached`. `named_function`: function to name in messages, if not `function`. `allocates`: see
-    `callback`.
+    `digests`: see `compile_cached`. `allocates`: see `callback`. `named_function`: function to name in messages.
     """
     compiled, more = add_bounds_checks(function)
     options = {**_NUMBA_OPTIONS, **more} if allocates else {**_NUMBA_OPTIONS, **more, "_nrt": False}
@@ -386,7 +385,7 @@ def compile_callback(
         digests = f"{digests[0]} {options}", digests[1]
     try:
         dispatcher = compile_cached(compiled, KINDS[kind].read_only_signature, digests, **options)
-    except Exception as error:  # numba reports errors in the function by many types, also failed assertions
+    except Exception as error:  # numba raises many types of errors, also failed assertions
         dispatcher = _compile_with_writable_inputs(kind, compiled, digests, named_function or function, error, options)
     else:
         add_signature(dispatcher, KINDS[kind].signature)
@@ -405,7 +404,7 @@ def _compile_with_writable_inputs(
     error: Exception,
     options: dict[str, Any],
 ) -> Dispatcher:
-    """Compile a callback for writable input arrays, after `error` for read-only ones, which its helpers may not accept.
+    """Compile a callback for writable inputs, as its helpers may not accept read-only ones, which raised `error`.
 
     Raise TypeError if it does not compile either, or if `error` shows that the callback writes to its inputs.
     """
@@ -444,7 +443,6 @@ def zero_callback(kind: str) -> Dispatcher:
 
 
 def _failure_message(kind: str, function: Callable[..., Any], error: Exception) -> str:
-    """Return the error message for a function that numba cannot compile; it quotes one line of numba's message."""
     return (
         f"{kind}: numba cannot compile the function {_name_and_location(function)}; it must use numbers, numpy arrays "
         f"of one type and of the shape that {kind} asks for, and functions that numba knows (helpers need numba.njit)\n"
@@ -471,7 +469,7 @@ def _remove_colours(error: Exception) -> str:
 
 
 def _informative_line(error: Exception) -> str:
-    """Return the name of the type of an error, and that line of numba's message which states the reason."""
+    """Return the type of an error, and that line of numba's message which states the reason."""
     message = _remove_colours(error)
     message = re.sub(r":\s*>>> ", ": ", _SOURCE_EXCERPT.sub("", message))  # remove the sign before a rejected signature
     lines = [line.strip() for line in message.splitlines() if line and not line.startswith("    ")]
