@@ -3,7 +3,7 @@
 A mechanism's Jacobian has few nonzero entries, and their pattern does not change. So the order of elimination is chosen
 once for each partition (Markowitz's rule with a threshold), and written as a program, a list of operations. Later
 factorizations follow this program, without a search for pivots and without tests for zeros. If entries of L become
-large, another order is chosen. Factors are dense if sparse ones would need more than half of their operations.
+large, another order is chosen. Factors are dense if sparse factors would not save half of the operations.
 
 The factors of a matrix are two arrays: `index`, the program, and `values`. Right-hand sides and solutions are in the
 order of elimination: entry k of a right-hand side belongs to row rows_of(index)[k] of the Jacobian, and entry k of a
@@ -51,7 +51,7 @@ ORDER_CHOSEN, SINGULAR_MATRIX, TOO_MANY_ENTRIES = range(3)
     ACTIVE_ROW_SIZE,  # for each row: number of its entries in columns that are not eliminated yet
     ROW_POSITION,  # for each row: its position in the order of elimination that has been chosen so far
     COLUMN_POSITION,  # for each column: its position in the order of elimination that has been chosen so far
-    LOOKUP,  # scratch, for each row or column: where its entry is stored in the list that is being changed
+    LOOKUP,  # scratch, for each row (or column): where its entry in the current column (or row) is stored
     N_COUNTS,
 ) = range(7)
 # indices in `lists`, scratch for choosing an order: lists with the entries of each row or column
@@ -71,7 +71,7 @@ def values_size(r: int, may_be_dense: bool = True) -> int:
 
 
 def max_subtractions(r: int) -> int:
-    """Return the number of subtractions in a program for r rows for which memory is allocated: no program has more."""
+    """Return the largest number of subtractions of a program for r rows; if there are more, factors are dense."""
     return min(r * r * (r + 1) // 2, MIN_SUBTRACTIONS + SUBTRACTIONS_PER_ROW * r)
 
 
@@ -95,25 +95,25 @@ def row_exchanges_of(index):
 
 @merged
 def index_of_upper_begins(r):
-    """Return the offset of a list in the program `index`: where each row of U begins in `values`; r: number of rows."""
+    """Return the offset, in `index` for r rows, of the list of indices at which the rows of U begin in `values`."""
     return N_HEAD + 3 * r
 
 
 @merged
 def index_of_upper_ends(r):
-    """Return the offset of a list in the program `index`: where each row of U ends in `values`; r: number of rows."""
+    """Return the offset, in `index` for r rows, of the list of indices at which the rows of U end in `values`."""
     return N_HEAD + 4 * r
 
 
 @merged
 def index_of_lower_begins(r):
-    """Return the offset of a list in the program `index`: where each row of L begins in `values`; r: number of rows."""
+    """Return the offset, in `index` for r rows, of the list of indices at which the rows of L begin in `values`."""
     return N_HEAD + 5 * r
 
 
 @merged
 def index_of_entries(r):
-    """Return the offset in the program `index` of three lists: row, column and source of each entry of L and U."""
+    """Return the offset, in `index` for r rows, of three lists: row, column and source of each entry of L and U."""
     return N_HEAD + 6 * r + 1
 
 
@@ -192,7 +192,7 @@ def _choose_pivot(matrix, rows, columns, k):
 
 @merged
 def _exchange(order, position, k, chosen):
-    """Exchange two entries of `order`, so that `chosen` is entry k; return -1, or 1 if it was there already."""
+    """Exchange two entries of `order`, so that `chosen` is entry k; return -1, or 1 if the order stays the same."""
     previous, exchanged = position[chosen], order[k]
     order[k], order[previous] = chosen, exchanged
     position[chosen], position[exchanged] = k, previous
@@ -394,9 +394,9 @@ def factor(entries, index, values):
 
 @merged
 def run_program(index, values):
-    """Factor the matrix in `values` in place, by the program in `index`; return min|pivot| / max|pivot|.
+    """Factor the matrix in `values` in place, by the program in `index`; return min|pivot| / max|pivot|, or -1.
 
-    If a pivot is zero or NaN, or if the magnitude of an entry of L exceeds MAX_MULTIPLIER, return -1.
+    It is -1 if a pivot is zero or NaN, or if the magnitude of an entry of L exceeds MAX_MULTIPLIER.
     """
     r, n_slots = index[SIZE], index[N_SLOTS]
     column_list = index_of_entries(r) + n_slots

@@ -11,10 +11,8 @@ from numba import types
 from twoloop.kernels.data.common import INTEGERS, MATRIX, VECTOR, compiled, f8, i8, kernel, merged
 from twoloop.kernels.linalg.dense import copy_matrix, largest_of, ldl_factor, ldl_solve, ldl_solve_rows
 
-# assumed rounding error of the dot product of two rows, relative to (sum of squares of all entries) * (number of rows)
-ROUNDING_OF_SQUARES = 4.0 * 2.0**-52
-# a row is orthogonalised again if the squared norm of its orthogonal part is below this fraction of its squared norm
-REORTHOGONALISE_BELOW = 0.5
+ROUNDING_OF_SQUARES = 4.0 * 2.0**-52  # error of dot products of n rows, relative to n times the sum of all squares
+REORTHOGONALISE_BELOW = 0.5  # a row is orthogonalised again if its orthogonal part is below this share of its |row|^2
 
 
 @compiled
@@ -79,13 +77,13 @@ def select_rows(G, min_sine, basis, factors, kept):
 
 @kernel(i8(MATRIX, f8, MATRIX, MATRIX, INTEGERS), vectorized=True)
 def independent_rows(G, min_sine, basis, factors, kept):
-    """Call `select_rows` and return its result: a kernel, because Python cannot call `select_rows` itself."""
+    """Select independent rows of G as `select_rows` does: this kernel is for callers in Python."""
     return select_rows(G, min_sine, basis, factors, kept)
 
 
 @merged
 def _fill_coefficients(n, basis, factors, row, coefficients):
-    """Express `row` approximately by the n rows from `select_rows`: store the `coefficients` (n) of their sum."""
+    """Approximate `row` by a linear combination of the n rows that `select_rows` selected; store its `coefficients`."""
     for k in range(n):
         coefficients[k] = _dot(basis[k], row)
     for k in range(n - 1, -1, -1):
@@ -159,12 +157,10 @@ TINY = 1e-300  # replaces zero as a divisor
 # times its norm. If neither is true of some row, or if eigenvalues differ more, `select_rows` decides for all rows
 SIMILAR_EIGENVALUES, INDEPENDENT, DEPENDENT = 1e-7, 1e-10, 1e-10
 # A redundant row is a linear combination of independent rows, all scaled to norm 1. It replaces an independent row if
-# the coefficient of this row exceeds MAX_COEFFICIENT: then the independent rows are farther from becoming dependent, as
-# they do at each dead centre of a slider-crank with two rods. Coefficients of 1 are common; they must cause no exchange
+# the coefficient of this row exceeds MAX_COEFFICIENT: so independent rows are less likely to become dependent during
+# the motion, as happens at dead centres. Coefficients of 1, which are common, must not cause exchanges
 MAX_COEFFICIENT = 1.5
-# two coefficients count as equal if their ratio is at most this; the first is chosen. Otherwise, in symmetrical
-# mechanisms, rounding errors would choose among many equal coefficients, differently at each start
-TIE_RATIO = 1.01
+TIE_RATIO = 1.01  # coefficients count as equal up to this ratio, so that rounding errors do not choose among them
 ZERO_ENTRY = 1e-12  # entries up to this fraction of the largest in their row count as zero: they may be rounding errors
 
 
@@ -206,10 +202,7 @@ def _eigenvalue_bounds(mass):
 
 @compiled
 def _count_weak_eigenvalues(mass, weak_ratio, A):
-    """Return the number of eigenvalues of the mass matrix M below a limit z, and store the factors of M - z I in A.
-
-    z is `weak_ratio` times an upper bound on the largest eigenvalue.
-    """
+    """Count eigenvalues of the mass matrix M below z = weak_ratio * (bound of all); store factors of M - z I in A."""
     _, largest = _eigenvalue_bounds(mass)
     copy_matrix(mass, A)
     for i in range(len(mass)):
@@ -234,8 +227,7 @@ def _sort_rows_by_entries(G, order, counts):
 def _removes_weak_eigenvalue(A, g, scale, x):
     """Return True if adding scale * g^T g to the mass matrix M raises one of its eigenvalues above the limit z.
 
-    This is so if det(M - z I) changes its sign. A contains the factors of M - z I from `_count_weak_eigenvalues`, and g
-    is a row of the Jacobian; x is scratch.
+    Then det(M - z I) changes its sign. A: factors of M - z I; g: a row of the Jacobian; x: scratch.
     """
     for j in range(x.size):
         x[j] = g[j]
@@ -250,9 +242,9 @@ def _removes_weak_eigenvalue(A, g, scale, x):
 def _add_rows_to_mass(mass, G, weak_ratio, scale, A, x, order, added):
     """Add scale * g^T g to the mass matrix M, for some rows g of G, until all its eigenvalues are large enough.
 
-    They must exceed `weak_ratio` times the largest. Rows are tried in the sequence of `order`, in which -1 then
-    replaces each added row. Store the indices of added rows in `added`; return their number, or STAYS_SINGULAR if
-    eigenvalues are still too small and no further row helps.
+    They must exceed `weak_ratio` times the largest. Rows are tried in the sequence of `order`; on return, -1 replaces
+    added rows in it. Store the indices of added rows in `added`; return their number, or STAYS_SINGULAR if eigenvalues
+    are still too small and no further row helps.
     """
     n_added = 0
     while _count_weak_eigenvalues(mass, weak_ratio, A) > 0:
@@ -287,9 +279,9 @@ def _list_rows(is_kept, kept):
 def _exchange_rows(C, is_kept, kept):
     """Exchange independent rows with redundant rows, so that the independent ones are farther from dependence.
 
-    C[i, k] is the coefficient of independent row k in redundant row i, both scaled to norm 1. These rows are exchanged
-    if |C[i, k]|, by which this multiplies the volume that the independent rows span, exceeds MAX_COEFFICIENT. Update C
-    and `is_kept` (1: independent, 0: redundant); store the indices of independent rows in `kept`, return their number.
+    C[i, k] is the coefficient of independent row k in redundant row i, both scaled to norm 1. The rows are exchanged if
+    |C[i, k]| exceeds MAX_COEFFICIENT: this multiplies the volume that independent rows span by |C[i, k]|. Update C and
+    `is_kept` (1: independent, 0: redundant); store the indices of independent rows in `kept`, and return their number.
     """
     n = len(C)
     n_kept = _list_rows(is_kept, kept)
@@ -322,7 +314,7 @@ def _exchange_rows(C, is_kept, kept):
 
 @compiled
 def _fill_scaled_products(mass, G, factors, solved, S, sizes):
-    """Store in S the upper triangle of G M^-1 G^T, scaled to a diagonal of 1; return False if M is not definite.
+    """Store in S the upper triangle of G M^-1 G^T, with a diagonal of 1; return False if M is not positive definite.
 
     `sizes` receives the factors that scale the rows of G, or 0 for rows of zeros. `factors` and `solved` are scratch.
     """

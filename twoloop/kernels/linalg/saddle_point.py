@@ -52,7 +52,7 @@ from twoloop.kernels.linalg.markowitz_lu import solve as solve_dependent
 
 @compiled
 def find_null_space(w):
-    """Store in w.D, but not in its last row, the matrix D: G v = 0 if dependent v are D^T times independent v."""
+    """Store D in w.D: velocities satisfy G v = 0 if the dependent ones are D^T times the independent ones."""
     rows, independent = rows_of(w.index_v), w.independent_v
     for j in range(independent.size):
         for k in range(rows.size):
@@ -62,7 +62,7 @@ def find_null_space(w):
 
 @merged
 def _reduce_diagonal_mass(columns, independent, M, D, A, m):
-    """Store in A the upper triangle of T^T M T, for a diagonal mass matrix M; columns of T = [I; D^T]: null space."""
+    """Store in A the upper triangle of T^T M T, for a diagonal mass matrix M; T = [I; D^T]: null space of Jacobian."""
     for k in range(columns.size):
         m[k] = M[columns[k], columns[k]]
     for i in range(independent.size):
@@ -76,7 +76,7 @@ def _reduce_diagonal_mass(columns, independent, M, D, A, m):
 
 @merged
 def _reduce_dense_mass(columns, independent, M, D, A, MT):
-    """Store in A the upper triangle of T^T M T, for any mass matrix M; columns of T = [I; D^T]: null space."""
+    """Store in A the upper triangle of T^T M T, for any mass matrix M; T = [I; D^T]: null space of the Jacobian."""
     n, n_dof = M.shape[0], independent.size
     for i in range(n):
         for j in range(n_dof):
@@ -162,7 +162,7 @@ def multipliers_by_elimination(f, w, r, a, lam):
 
 @merged
 def factor_mass(f, w):
-    """Store in w.L the factors of the mass matrix w.M (its inverse, if M is constant, not banded); return a code."""
+    """Store in w.L the factors of the mass matrix w.M (if M is constant and not banded, M^-1); return a code."""
     if has_banded_mass(f):
         is_definite = factor_banded_mass(f, w) == DONE
     else:
@@ -201,7 +201,7 @@ def _is_equal(A, B):
 
 @merged
 def factor_schur_complement(f, w):
-    """Store in w.S the factors of G M^-1 G^T, if they are not those of the present M and G yet; return a code."""
+    """Store in w.S the factors of G M^-1 G^T, unless M is constant and G the same as before; return a code."""
     is_constant = f.constant_mass == 1
     if is_constant and _is_equal(w.G, w.G_of_S):
         return DONE
@@ -286,7 +286,7 @@ def _write_augmented_program(w):
 
 @compiled
 def _run_augmented_program(w):
-    """Factor the augmented matrix in w.values_a; return False if a pivot is zero or NaN, or an entry of L too large."""
+    """Factor the augmented matrix by its program; return False if a pivot is zero or NaN, or an entry of L is large."""
     index, values, scale, first_of_mass = w.index_a, w.values_a, w.mass_scale, w.entries.size
     source = index_of_entries(index[at.SIZE]) + 2 * index[at.N_SLOTS]
     for s in range(index[at.N_SLOTS]):
@@ -349,7 +349,7 @@ def _factor_augmented_or_dense(f, w):
 
 @merged
 def factor(f, w):
-    """If w.factored is not 1, factor the equations of the accelerations in the form f.form; return a code."""
+    """Factor the equations of the accelerations in the form f.form, unless w.factored is 1 (done); return a code."""
     if w.factored == 1.0:
         return DONE
     code = _factor_augmented_or_dense(f, w) if f.form == AUGMENTED else DONE

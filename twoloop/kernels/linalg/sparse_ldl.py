@@ -60,10 +60,7 @@ def _fill_stiffness(program, mass, jacobian, stiffness, scratch):
 
 @merged
 def fill_saddle_matrix(program, mass, jacobian, values, stiffness, scratch):
-    """Store in `values` the matrix [M G^T; G 0] to be factored; add s g^T g to a singular M, for some rows g of G.
-
-    The numbers s are stored in `stiffness`, see `_fill_stiffness`. `scratch` has one number for each pivot.
-    """
+    """Store in `values` the matrix [M G^T; G 0] to be factored; add s g^T g to a singular M, see `_fill_stiffness`."""
     for s in range(values.size):
         values[s] = 0.0
     _, _, slots = mass_entries_of(program)

@@ -34,7 +34,7 @@ from twoloop.kernels.linalg.symbolic_factorization import (
     update_runs_of,
 )
 
-MIN_PIVOT = 1e-11  # `factor` fails if |pivot| is at most this fraction of the sum of all |terms| whose sum the pivot is
+MIN_PIVOT = 1e-11  # a pivot is a sum of terms; `factor` fails if |pivot| is at most this fraction of the sum of |terms|
 
 
 def newton_program(
@@ -71,8 +71,7 @@ def column_groups(entries: Entries, n_q: int) -> Integers:
     for i, j in zip(*(indices.tolist() for indices in entries), strict=True):
         rows_of[j].append(i)
     groups = np.zeros(n_q, dtype=np.int64)
-    # for each row: the groups that already have a column with an entry in this row
-    groups_by_row: list[set[int]] = [set() for _ in range(n_q)]
+    groups_by_row: list[set[int]] = [set() for _ in range(n_q)]  # groups of the columns with an entry in a row
     for j, rows in enumerate(rows_of):
         groups_in_rows = set().union(*(groups_by_row[i] for i in rows))
         groups[j] = group = next(k for k in range(n_q) if k not in groups_in_rows)
@@ -83,11 +82,7 @@ def column_groups(entries: Entries, n_q: int) -> Integers:
 
 @inlined
 def tangent_entries_of(program):
-    """Return the rows and columns of the entries of K and D, and the index of the first entry of each group of columns.
-
-    K and D are derivatives of the forces; one displacement yields all columns of a group. The list of indices ends with
-    the number of entries.
-    """
+    """Return the rows and columns of entries of the force derivatives K and D; where column groups begin, and end."""
     group_begins = program[end_of_sections(program) :]
     rows, columns, _ = mass_entries_of(program)
     n_mass = rows.size - group_begins[group_begins.size - 1]

@@ -61,16 +61,15 @@ class _PartSupports:
         self.lone_bodies = lone_bodies
         self.parts = _DisjointSets(n_bodies)
         self.is_grounded = [False] * n_bodies
-        self.hubs_by_part: list[set[int]] = [set() for _ in range(n_bodies)]  # supporting hubs, by a part's first body
-        # for each hub: one body of each part that the hub supports or has supported
-        self.supported_bodies: dict[int, list[int]] = {hub: [] for hub in hubs}
+        self.hubs_by_part: list[set[int]] = [set() for _ in range(n_bodies)]  # hubs that support a part, by first body
+        self.supported_bodies: dict[int, list[int]] = {hub: [] for hub in hubs}  # a body of each part supported so far
 
     def can_eliminate(self, joint: int) -> bool:
         """Return True if a joint may be eliminated before the remaining hubs (bodies with many joints).
 
         A part is a set of bodies that eliminated joints connect; the ground or hubs support it. The joint may be
-        eliminated if neither it nor the supports of the parts that it connects involve a hub. It may also be eliminated
-        if one of these parts has no support, unless the joint involves one of the `lone_bodies`.
+        eliminated if it involves no hub, and no hub supports a part that it connects. It may also be eliminated if one
+        of these parts has no support, unless the joint involves one of the `lone_bodies`.
         """
         bodies = self.joints[joint]
         parts = {self.parts.find(body) for body in bodies if body not in self.hubs}
@@ -119,19 +118,12 @@ def elimination_order(
 ) -> Integers:
     """Return the order of elimination (n_q + n_rows): j for coordinate j, n_q + i for row i of G.
 
-    Parameters
-    ----------
-    n_q, n_rows : int
-    mass_entries, jacobian_entries : (rows, columns)
-        Indices of the nonzero entries of M (mass matrix) and of G (constraint Jacobian).
-    body_groups : iterable of sequence of int
-        Groups of coordinates that form one body each, even if M does not couple them.
-    early_rows : sequence of int
-        Rows of G that involve a single body each. Unless the body is a hub (it has many joints), these rows are
-        eliminated before all joints, so that a dependence on other rows cannot make their pivots small.
-    couplings : (rows, columns), optional
-        Entries of K and D (derivatives of the forces), which couple bodies as springs do. If given, all bodies are
-        treated as hubs, and each body is eliminated together with its `early_rows`.
+    mass_entries, jacobian_entries : rows and columns of the entries of M (mass matrix) and G (constraint Jacobian).
+    body_groups : groups of coordinates that form one body each, even if M does not couple them.
+    early_rows : rows of G that involve a single body each. Unless the body is a hub (it has many joints), these rows
+        are eliminated before all joints, so that a dependence on other rows cannot make their pivots small.
+    couplings : rows and columns of the entries of K and D (derivatives of the forces), which couple bodies as springs
+        do. If given, all bodies are treated as hubs, and each body is eliminated together with its `early_rows`.
     """
     body_of = bodies_of(n_q, mass_entries, body_groups)
     bodies_in_row: list[set[int]] = [set() for _ in range(n_rows)]
@@ -202,8 +194,7 @@ def _minimum_degree_order(
     """Return the order of elimination of joints and hubs as indices: k for joint k, len(joints) + k for hub k.
 
     Hubs are bodies with many joints. The next joint or hub is the one, of those allowed, whose neighbours have the
-    fewest rows and coordinates (`sizes`). `pairs`: hubs coupled otherwise than by a joint. `lone_bodies`: see
-    `_PartSupports`.
+    fewest rows and coordinates (`sizes`). `pairs`: hubs coupled without a joint. `lone_bodies`: see `_PartSupports`.
     """
     n_joints = len(joints)
     node_of = {hub: n_joints + k for k, hub in enumerate(hubs)}
@@ -350,7 +341,7 @@ def _update_runs(targets: Integers, diagonal: NDArray[np.bool_]) -> Integers:
 
 
 def _products_of_entries(rows: Integers, chosen: Sequence[int]) -> tuple[Integers, Integers, Integers]:
-    """List the pairs of entries whose products form g^T g, for each row g in `chosen`: row, indices of both entries."""
+    """List the pairs of entries whose products form g^T g, for rows g in `chosen`: row and indices of both entries."""
     parts: list[tuple[Integers, Integers, Integers]] = [(rows[:0], rows[:0], rows[:0])]
     sequence = np.argsort(rows, kind="stable")
     sorted_rows = rows[sequence]
@@ -407,7 +398,7 @@ def pivot_order_of(program):
 
 @inlined
 def factor_columns_of(program):
-    """Return two lists: where each column of L begins, then the number of its entries; and the row of each entry."""
+    """Return two lists: where each column of L begins, with the end of the last one; and the row of each entry."""
     begin = N_HEAD + program[N_PIVOTS]
     middle = begin + program[N_PIVOTS] + 1
     return program[begin:middle], program[middle : middle + program[N_OFF_DIAGONAL]]
@@ -415,7 +406,7 @@ def factor_columns_of(program):
 
 @inlined
 def update_runs_of(program):
-    """Return the ranges of an elimination's updates: length of each, and index of the first entry that it changes."""
+    """Return the ranges of adjacent entries that updates change: for each, its length and index of its first entry."""
     begin = N_HEAD + 2 * program[N_PIVOTS] + 1 + program[N_OFF_DIAGONAL]
     return program[begin : begin + program[N_RUNS]]
 

@@ -1,8 +1,8 @@
 """Attempt steps by backward differentiation formulas of orders 1 to 5, with a fixed-point outer loop.
 
 The formulas apply to the independent positions and velocities (q_i, v_i). The history is a table of modified divided
-differences (Krogh) of all coordinates and velocities, so that a new partition needs no conversion. They are scaled to
-the size of each step, as in DASSL and IDA (fixed leading coefficient). `f` is the kit, `w` the workspace.
+differences (Krogh) of all coordinates and velocities, so that a new partition needs no conversion. It is scaled to the
+size of each step, as in DASSL and IDA (fixed leading coefficient). `f` is the kit, `w` the workspace.
 """
 
 from typing import Any
@@ -23,7 +23,7 @@ N_DIFFERENCES = MAX_ORDER + 2  # differences of orders 0 to MAX_ORDER + 1
 STARTER_STAGES = 3  # number of stages of the Gauss steps at the beginning of a run with fixed step size
 MAX_ITERATIONS = 60  # number of fixed-point iterations after which a step has failed
 SAFETY = 0.9  # safety factor on the size of a repeated step; also smallest ratio of step sizes after an accepted step
-MIN_STEP_FACTOR = 0.2  # smallest ratio of step sizes after a rejected step, or if `prediction_error` is large
+MIN_STEP_FACTOR = 0.2  # smallest ratio of step sizes after a rejected step, or if predicted positions are inaccurate
 ERROR_FACTOR = 10.0  # factor on the error estimate, because the errors of many short steps add up
 STEP_SIZE_FACTOR = 6.0  # further factor on the estimate in the choice of the next step size, to avoid rejections (VODE)
 ORDER_FACTOR = 1.4  # factor on the error estimates of the next lower and higher order, so that the order changes rarely
@@ -43,7 +43,7 @@ HIGHEST, INNER_TOL, OUTER_TOL, N_OPTION_SCALARS = range(4)
     N_MEMORY_SCALARS,
 ) = range(7)
 # indices of rows in `memory`. SPANS: times (s) from earlier states of the history to the last one. NEW_SPANS: times (s)
-# from states of the history to the end of the step. ERROR_CONSTANTS[k]: ratio of error to difference k + 1 at order k
+# from these states to the end of the step. ERROR_CONSTANTS: for each order k, error / (difference of order k + 1)
 SPANS, NEW_SPANS, ERROR_CONSTANTS, N_ROWS = range(4)
 
 
@@ -103,7 +103,7 @@ def commit_bdf(f, w, options, memory, tolerances, accepted):
 
 @compiled
 def _begin_history(memory, differences, state, h, order):
-    """Start a history from `state` = [q, v, a, ...] for steps of size h (s); `order` (0 or 1): of the first step."""
+    """Start a history from `state` = [q, v, a, ...] for steps of size h (s); `order`: of the first step, 0 or 1."""
     size = differences.shape[1]
     for m in range(size):
         differences[0, m] = state[m]
@@ -284,7 +284,7 @@ def _gauss_step(f, w, options, tolerances, t, h, state, new_state, scratch):
 def bdf_step(f, w, options, memory, t, h, tolerances, state, new_state):
     """Attempt a step: predict from the history, correct, and choose the order and the size of the next step.
 
-    If the step size is fixed, the order is options[HIGHEST]; as many Gauss steps, at the start, fill the history.
+    If the step size is fixed, the order is options[HIGHEST], after as many Gauss steps, which fill the history.
     """
     n = w.Q.size
     differences, trial, prediction, rate, scratch = _history_views(memory, n)

@@ -110,7 +110,7 @@ def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
 RUNGE_KUTTA = Step(runge_kutta_step, commit_runge_kutta)
 
 
-SUDDEN_ERROR = 10.0  # steps with a larger `estimate_end_error` * END_ERROR_WEIGHT are rejected: not in the paper
+SUDDEN_ERROR = 10.0  # a step is rejected if jumps of forces cause a larger error (in tolerances); not in the paper
 
 
 @kernel(ATTEMPT)

@@ -73,9 +73,7 @@ def rounding_errors_of(memory, s, n, tolerances):
 
 MAX_ITERATIONS = 60  # number of iterations after which `iterate_accelerations` has failed
 MAX_ITERATIONS_PAPER = 200  # number of iterations after which `iterate_first_order` has failed; the paper has no limit
-# an iteration has diverged if a change of the stages exceeds this multiple of the first change. Changes may grow at
-# first, because the iteration matrix is not normal
-MAX_GROWTH = 1e3
+MAX_GROWTH = 1e3  # divergence: a change of the stages exceeds this multiple of the first change (it may grow at first)
 MIN_ITERATIONS = 8  # after this number of iterations, a change that is not below the previous one means divergence
 UNDECIDED, CONVERGED, DIVERGED = range(3)  # codes of `_test_convergence`
 
@@ -108,7 +106,7 @@ def _compensated_sum(x, rounding, increment):
 
 @merged
 def _clear_rounding_errors(coordinates, rounding):
-    """Set this attempt's rounding errors of dependent `coordinates` to zero, as these are no sums over the steps."""
+    """Set this attempt's rounding errors of dependent `coordinates` to zero: the inner loop computes these anew."""
     for i in range(N_ROUNDING // 2, rounding.shape[0]):
         for m in coordinates:
             rounding[i, m] = 0.0

@@ -9,8 +9,7 @@ from twoloop.kernels.evaluation.inner_loop import evaluate_state, rounding_floor
 from twoloop.kernels.linalg.dense import copy
 
 MAX_ITERATIONS = 60  # number of fixed-point iterations after which a step has failed
-# if a step increases the largest |coordinate| by more than this factor, motion begins: see `_motion_rate`
-GROWTH_AFTER_REST = 2.0
+GROWTH_AFTER_REST = 2.0  # motion begins if a step increases the largest |coordinate| so far by more than this factor
 TINY = 1e-300  # added to the allowed error of a step, which may be 0 for a mechanism at rest at the origin
 
 # indices in `memory`: largest |coordinate|, |velocity| and |acceleration| so far. Scratch (n_q) follows

@@ -45,8 +45,7 @@ def _error_constants():
     return np.abs(coefficients)
 
 
-# error constants for equal steps, used as lower bounds: after a decrease of h, the constants for the actual steps are
-# smaller, and would underestimate the error if the force jumps
+# for equal steps; used as lower bounds, because constants of steps after a decrease of h are too small if a force jumps
 ERROR_CONSTANTS = _error_constants()
 
 THETA, N_OPTIONS = range(2)  # index in `options`: tolerance at which projections end, see `project`
@@ -62,8 +61,9 @@ THETA, N_OPTIONS = range(2)  # index in `options`: tolerance at which projection
     NEXT_ORDER,  # order chosen at the end of an attempt for the next one
     N_SCALARS,
 ) = range(8)
-# indices of rows in `memory` (symbols: see above). PSI, NEW_PSI: times psi(n), psi(n+1) (s). BETA: factors beta.
-# G_VELOCITY, G_POSITION: coefficients g for velocities and G for positions. C_AT_NODES: values of one c_i at NODES
+# indices of rows in `memory`. PSI, NEW_PSI: times (s) from earlier states to the last one, and to the end of the step.
+# BETA: factors that scale differences to the step. G_VELOCITY, G_POSITION: coefficients of the scaled differences in
+# velocities and positions. C_AT_NODES: scratch
 PSI, NEW_PSI, BETA, G_VELOCITY, G_POSITION, C_AT_NODES, N_ROWS = range(7)
 
 
@@ -139,7 +139,7 @@ def _begin_history(memory, n, state):
 
 @merged
 def _compute_coefficients(memory, h, k):
-    """Store the coefficients of a step of size h at order k in `memory`: psi(n+1), beta, g for v, and G for q."""
+    """Store the coefficients of a step of size h at order k: the rows NEW_PSI to G_POSITION of `memory`."""
     psi, new_psi, beta = _row(memory, PSI), _row(memory, NEW_PSI), _row(memory, BETA)
     g, G, c = _row(memory, G_VELOCITY), _row(memory, G_POSITION), _row(memory, C_AT_NODES)
     new_psi[0] = h
@@ -226,7 +226,7 @@ def _predict_state(memory, h, k, old, new, state, q1, v1, n):
 def _estimate_error(g, G, h, order, largest_v, largest_q):
     """Return the estimated error of a step at `order`, in units of the tolerances; g, G: coefficients for v and for q.
 
-    `largest_v`, `largest_q`: largest |component| of phi_{order+1} / tolerance, for velocities and for positions.
+    `largest_v`, `largest_q`: largest |difference phi_{order+1}| / tolerance of velocities, and of positions.
     """
     return max(h * abs(g[order - 1] - g[order]) * largest_v, h * h * abs(G[order - 1] - G[order]) * largest_q)
 

@@ -30,8 +30,7 @@ from twoloop.kernels.steps.stages import lagrange_values
 # the Legendre coefficients (S, S each); b, b @ A, c (S each)
 INNER_TOL, THETA, N_SCALARS = range(3)
 S = 20  # number of Gauss nodes, which are the stages
-# the iteration has converged when a sweep changes accelerations by at most CONVERGED_CHANGE tolerances
-CONVERGED_CHANGE = 0.01
+CONVERGED_CHANGE = 0.01  # the iteration has converged if a sweep changes accelerations by at most this (in tolerances)
 # the iteration has also converged if a sweep changes accelerations by at most STALL_CHANGE tolerances, and by at least
 # STALL_RATIO times the change by the sweep before: rounding errors then keep the change from decreasing
 STALL_RATIO, STALL_CHANGE = 0.5, 0.3
@@ -42,20 +41,17 @@ MAX_LEFT_OUT_NODES = 9  # the step fails if more nodes are left out
 # arguments of `begin_polynomial`. BEGIN, DURATION, END (s): of the polynomial of the last converged attempt; if there
 # is none, END = -inf
 LARGEST_PIVOT, EARLIEST, MAY_APPROACH, NODE_DISTANCE, BASE, BEGIN, DURATION, END, N_STORED = range(9)
-# duration of the shortest and of the longest step along the polynomial, relative to the duration of the polynomial
-SHORTEST_PIECE, LONGEST_PIECE = 0.05, 0.2
+SHORTEST_PIECE, LONGEST_PIECE = 0.05, 0.2  # limits of the steps along a polynomial, relative to its duration
 NODE_GAP = 0.0767  # longest time between two successive nodes, relative to the duration of the polynomial
 BACKWARD_FRACTION = 0.4  # largest part of the polynomial that precedes the step, relative to its whole duration
 ORDER, ERROR_FACTOR = 12.0, 0.5  # the error estimate is about proportional to h^ORDER; factor on the estimate
-# if a projection changes a stage by x tolerances, the error estimate of the step is at least PROJECTION_WEIGHT x
-PROJECTION_WEIGHT = 0.5
+PROJECTION_WEIGHT = 0.5  # if a projection changes a stage by x tolerances, the error estimate is at least this times x
 ROUNDING = 1e-13  # relative tolerance of the iteration in steps of fixed size, and of comparisons of times
 MIN_PIVOT_RATIO = 0.5  # a step fails if the pivot at its end is below this * pivot at its beginning; see FAR_END
-END_MARGIN = 2.0  # a step fails if the pivot at its end is below this * pivot of nodes that are left out; see FAR_END
+END_MARGIN = 2.0  # a step fails if the pivot at its end is below this * smallest pivot allowed at nodes; see FAR_END
 FAR_END = 0.3  # no step fails if the smallest pivot of C_q at its end is at least this * largest pivot of the run
 LATE = S - 4  # node near the end: if the pivot is larger there than at the end, the end is before the singular position
-# an attempt that computes a polynomial returns this as error and as ratio of the next step size. As the error is above
-# 1, the step is repeated, and takes a piece of the polynomial
+# an attempt that computes a polynomial returns this as error and as step-size factor: it is then repeated along it
 REPEAT_FACTOR = 2.0
 TINY = 1e-300  # lower bound of divisors that may be zero
 
@@ -77,9 +73,8 @@ def begin_polynomial(memory, largest_pivot, earliest, may_approach, node_distanc
 
     `largest_pivot` is the largest pivot of the run so far; no node may lie before the time `earliest` (s). If
     `may_approach`, the polynomial may end before the singular position, nearer to it than it begins. `node_distance`
-    is a factor on the pivot below which nodes are left out. `base` is the time (s) and the state [q, v, ...] of an
-    earlier step, farther from the singular position: the polynomial goes through its q and v. If `base` is None, the
-    polynomial goes through q and v at the beginning of the step.
+    is a factor on the pivot below which nodes are left out. The polynomial goes through q and v of `base`, the time (s)
+    and the state [q, v, ...] of a step farther from the singular position; if None, of the beginning of the step.
     """
     stored = memory[-N_STORED:]
     stored[:] = np.nan
@@ -243,7 +238,7 @@ def _polynomial_at(time, duration, b, c, a, q_0, v_0, weights_v, weights_q, q, v
 
 @merged
 def _finish_piece(f, w, t, min_node_pivot, options, tolerances, stage, state, new_state):
-    """Project `stage`, the state [q, v, a] at the end of a step, onto the constraints: `new_state`. Return an Attempt.
+    """Finish a step: project its end `stage` = [q, v, a], store it in `new_state`, and return an Attempt.
 
     If `min_node_pivot` is positive, and the smallest pivot is below it or the projection fails, the state is stored
     without projection.
@@ -275,7 +270,7 @@ def _finish_piece(f, w, t, min_node_pivot, options, tolerances, stage, state, ne
 
 
 def state_at(memory, options, t):
-    """Return the state [q, v, a] (3 n) of the polynomial in `memory` at the time t (s)."""
+    """Return the state [q, v, a] (3 n) on the polynomial in `memory` at the time t (s)."""
     stored, n = memory[-N_STORED:], (memory.size - 3 * S - N_STORED) // (S + 7)
     b, _, c = options[N_SCALARS + 3 * S * S :].reshape((3, S))
     a, stage = memory[: S * n].reshape((S, n)), memory[S * n : (S + 5) * n].reshape((5, n))

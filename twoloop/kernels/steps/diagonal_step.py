@@ -49,8 +49,7 @@ from twoloop.kernels.steps.velocity_errors import (
     velocity_error,
 )
 
-# a matrix A counts as symmetric if |A_ij - A_ji| is at most this fraction of its largest diagonal entry
-MAX_ASYMMETRY = 1e-12
+MAX_ASYMMETRY = 1e-12  # a matrix A counts as symmetric if |A_ij - A_ji| is at most this fraction of its largest |A_ii|
 
 
 @compiled
@@ -85,7 +84,7 @@ def _fill_newton_matrix(w, memory, n, m, z, H):
 
 @compiled
 def factor_newton_matrix(w, memory, z):
-    """Factor the matrix of `_fill_newton_matrix`, with the derivatives of forces computed last; return a code."""
+    """Factor Newton's matrix (`_fill_newton_matrix`) with the last computed derivatives of forces; return a code."""
     n, m = w.Q.size, w.independent.size
     storage = matrix_storage(w, n, at.FILTER)
     H = as_matrix(storage, m)
@@ -103,7 +102,7 @@ def factor_newton_matrix(w, memory, z):
 
 @compiled
 def compute_and_factor_matrix(f, w, memory, t, q, v, z):
-    """Compute the derivatives of forces at (t, q, v), and factor the matrix of `_fill_newton_matrix`; return a code.
+    """Compute the derivatives of forces at (t, q, v), and factor Newton's matrix with them; return a code.
 
     The last evaluation must have been at (t, q, v), w.lam must be the multipliers there. z: step size times gamma.
     """
@@ -142,10 +141,7 @@ def _solve_newton_system(w, memory, x):
 
 @compiled
 def correct_stage(w, memory, residual, a):
-    """Replace `residual` (n_q) by the Newton correction of the accelerations a (n_q), and add the correction to a.
-
-    Only the entries of independent coordinates are read and changed.
-    """
+    """Replace `residual` by Newton's correction of the accelerations a, and add it to a: independent entries only."""
     n = w.Q.size
     m = w.independent.size
     N, x = as_matrix(matrix_storage(w, n, at.SYSTEMS), m), vector(memory, 1, n, at.V_MOVED)[:m]
@@ -180,12 +176,12 @@ MAX_ITERATIONS = 8  # largest number of Newton iterations of a stage: if they do
 DIVERGENCE_RATIO = 2.0  # Newton's method has diverged if a correction exceeds this multiple of the previous one
 LINEAR_FACTOR = 0.01  # factor on Newton's tolerance if derivatives are finite differences: convergence is then linear
 MAX_CONTRACTION = 0.1  # finite differences are renewed if a Newton correction exceeds this fraction of the previous one
-VELOCITY_WEIGHT = 0.1  # Newton's test counts this fraction of the later error in q that a correction of v prevents
+VELOCITY_WEIGHT = 0.1  # weight, in Newton's convergence test, of the effect that a correction of v has on q later
 
 
 @inlined
 def stage_views(memory, s, n):
-    """Return views of `memory`: velocities (s, n) and accelerations (s, n) of the stages, initial accelerations (n)."""
+    """Return views of `memory`: stage velocities (s, n), stage accelerations (s, n), accelerations (n) at the start."""
     last = memory.size - n
     return (
         memory[last - 2 * s * n : last - s * n].reshape((s, n)),
@@ -203,7 +199,7 @@ def gamma_of(options):
 
 @merged
 def has_dense_tangents(f, w):
-    """Return True if each Newton iteration computes derivatives of forces, and factors T^T (M - z^2 K - z D) T anew."""
+    """Return True if each Newton iteration computes derivatives of the forces anew, and factors a dense matrix."""
     return f.force_by_q_given == 1 and f.bandwidth < 0 and w.Rate.size == w.C.size and f.form != FIXED_ORDER
 
 
@@ -299,9 +295,7 @@ def solve_stage(f, w, options, memory, t, h, A_stage):
     return DONE
 
 
-# number of times that the difference between a step's result and that of its embedded formula is filtered before it is
-# subtracted. With fewer filters, the method is unstable for vibrations (tests/kernels/test_diagonal.py)
-N_FILTERS = 3
+N_FILTERS = 3  # how often the difference from the embedded result is filtered; if less often, vibrations are unstable
 
 # if the accelerations a_k of the stages jump once, |sum_k jump_weights[k] a_k| is at most this fraction of their range.
 # If the fraction is smaller, `_error_at_jumps` reduces its estimate in proportion
@@ -335,10 +329,7 @@ def _factor_filter(f, w, options, memory, h):
 
 @compiled
 def _store_weighted_sums(w, h, V_stage, A_stage, weights, factor, e_q, e_v):
-    """Store an error estimate: h * factor * sum_k weights[k] * V_stage[k] in e_q, the same with A_stage[k] in e_v.
-
-    Only independent coordinates are included: theirs are the first n_dof numbers of e_q and e_v (n_q).
-    """
+    """Estimate errors of independent q and v: e_q = h factor sum_k weights[k] V_stage[k]; e_v: the same of A_stage."""
     for i in range(w.independent.size):
         j = w.independent[i]
         sum_q, sum_v = 0.0, 0.0
@@ -493,10 +484,7 @@ def commit_diagonal(f, w, options, memory, tolerances, accepted):
 
 @kernel(ATTEMPT, vectorized=True)
 def diagonal_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """Attempt a step: solve for one stage after another.
-
-    The step ends at the last stage or, if the last of `options` is 1, at the result of the embedded formula.
-    """
+    """Attempt a step: solve for its stages in turn; if options[-1] is 1, end at the result of the embedded formula."""
     s = int(options[at.DIAGONAL_OFFSET])
     begin = at.DIAGONAL_OFFSET + 1
     A = options[begin : begin + s * s].reshape((s, s))
