@@ -65,8 +65,8 @@ class SeriesProgram:
 
     early : operations that depend on t and q only; after them, the products in G v.
     late : operations that depend on v, too; after them, the products in G^T lam + M a.
-    rows, row_indices : nonzero rows of G v + (C_t, b), without terms that have constant entries of G; their indices.
-    balance, balance_indices : likewise Q - G^T lam - M a, without terms that have constant entries of G or M.
+    rows, row_indices : nonzero rows of G v + (C_t, b), without terms "constant times v_i"; their indices.
+    balance, balance_indices : likewise Q - G^T lam - M a, without terms "constant times lam_i" or "constant times a_i".
     traced : traces of the callbacks, to be compared with calls; None: no comparison.
     """
 

@@ -194,7 +194,7 @@ RUN_ARRAYS.add_function("advance", i8(KIT, WORK, *(VECTOR,) * 9, MATRIX, MATRIX,
     RANK_LIMIT,  # a row of G is redundant if less than this fraction of it is orthogonal to other rows
     WEAK_LIMIT,  # M counts as singular if the ratio of its smallest to its largest eigenvalue is below this
     ADDED_SCALE,  # factor s: for a singular M, generated code uses M + s g^T g instead, where g are some rows of G
-    CONTRADICTS,  # a start is refused if a row of G a = gamma has a larger residual, relative to the sum of |terms|
+    CONTRADICTS,  # refuse a start if a row of G a = gamma has a larger residual, relative to 1 or the sum of |terms|
     MASS_FLAG,  # DEFINITE or INDEFINITE: a start is refused if M is not so; 0: M is constant, and not checked
     LEAST_PIVOT,  # a start is refused if the smallest pivot of C_q there is below this
     EQUATION_FORM,  # initial f.form, the algebra that solves for accelerations
