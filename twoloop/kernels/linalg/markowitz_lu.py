@@ -21,8 +21,7 @@ ZERO_PIVOT = 1e-11  # if |pivot| is at most this fraction of the largest |pivot|
 MIN_SUBTRACTIONS, SUBTRACTIONS_PER_ROW = 2000, 100
 MAX_ENTRIES_PER_LINE = 64  # largest number of entries in a row or column of sparse factors; with more, they are dense
 
-# codes of `choose_order`: success; the matrix is singular; sparse factors are not faster than dense ones
-ORDER_CHOSEN, SINGULAR_MATRIX, TOO_MANY_ENTRIES = range(3)
+ORDER_CHOSEN, SINGULAR_MATRIX, TOO_MANY_ENTRIES = range(3)  # codes of `choose_order`; the last: use dense factors
 
 # indices of the numbers at the beginning of `index`, the program of a factorization
 (
@@ -54,9 +53,8 @@ ORDER_CHOSEN, SINGULAR_MATRIX, TOO_MANY_ENTRIES = range(3)
     LOOKUP,  # scratch, for each row (or column): where its entry in the current column (or row) is stored
     N_COUNTS,
 ) = range(7)
-# indices in `lists`, scratch for choosing an order: lists with the entries of each row or column
-# - COLUMNS, SOURCES: for each row, the columns of its entries, and the indices of their initial values, see `factor`
-# - ROWS: for each column, the rows of its entries
+# indices in `lists`, scratch for choosing an order. COLUMNS, SOURCES: for each row, the columns of its entries, and the
+# indices of their initial values in the argument `entries` of `factor`. ROWS: for each column, the rows of its entries
 COLUMNS, SOURCES, ROWS, N_LISTS = range(4)
 
 
@@ -95,25 +93,25 @@ def row_exchanges_of(index):
 
 @merged
 def index_of_upper_begins(r):
-    """Return the offset, in `index` for r rows, of the list of indices at which the rows of U begin in `values`."""
+    """Return the offset, in a program for r rows, of a list: the indices at which rows of U begin in `values`."""
     return N_HEAD + 3 * r
 
 
 @merged
 def index_of_upper_ends(r):
-    """Return the offset, in `index` for r rows, of the list of indices at which the rows of U end in `values`."""
+    """Return the offset, in a program for r rows, of a list: the indices at which rows of U end in `values`."""
     return N_HEAD + 4 * r
 
 
 @merged
 def index_of_lower_begins(r):
-    """Return the offset, in `index` for r rows, of the list of indices at which the rows of L begin in `values`."""
+    """Return the offset, in a program for r rows, of a list: the indices at which rows of L begin in `values`."""
     return N_HEAD + 5 * r
 
 
 @merged
 def index_of_entries(r):
-    """Return the offset, in `index` for r rows, of three lists: row, column and source of each entry of L and U."""
+    """Return the offset, in a program for r rows, of three lists: row, column and source of each entry of L and U."""
     return N_HEAD + 6 * r + 1
 
 

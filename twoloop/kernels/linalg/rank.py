@@ -11,8 +11,8 @@ from numba import types
 from twoloop.kernels.data.common import INTEGERS, MATRIX, VECTOR, compiled, f8, i8, kernel, merged
 from twoloop.kernels.linalg.dense import copy_matrix, largest_of, ldl_factor, ldl_solve, ldl_solve_rows
 
-ROUNDING_OF_SQUARES = 4.0 * 2.0**-52  # error of dot products of n rows, relative to n times the sum of all squares
-REORTHOGONALISE_BELOW = 0.5  # a row is orthogonalised again if its orthogonal part is below this share of its |row|^2
+ROUNDING_OF_SQUARES = 4.0 * 2.0**-52  # rounding error of dot products of n rows, relative to n * sum of all |row|^2
+REORTHOGONALISE_BELOW = 0.5  # a row is orthogonalised again if |orthogonal part|^2 is below this fraction of |row|^2
 
 
 @compiled
@@ -147,8 +147,7 @@ def singular_values_exceed(rows, ratio, gram):
 
 
 BOUND_ROUNDING = 1e-12  # a bound of pivots is reduced by this fraction, so that pivots equal to it count as above it
-# codes of `choose_rows`: M with added rows is not positive definite; M is singular, and no row of G can change this
-NOT_DEFINITE, STAYS_SINGULAR = -1, -2
+NOT_DEFINITE, STAYS_SINGULAR = -1, -2  # codes: M with added rows is not positive definite; no rows make M invertible
 TINY = 1e-300  # replaces zero as a divisor
 # Limits that decide whether a row of G is independent of previous rows, if the smallest eigenvalue of the mass matrix M
 # exceeds SIMILAR_EIGENVALUES times the largest. S = G M^-1 G^T, scaled to a diagonal of 1, is factored. The row is
@@ -157,8 +156,8 @@ TINY = 1e-300  # replaces zero as a divisor
 # times its norm. If neither is true of some row, or if eigenvalues differ more, `select_rows` decides for all rows
 SIMILAR_EIGENVALUES, INDEPENDENT, DEPENDENT = 1e-7, 1e-10, 1e-10
 # A redundant row is a linear combination of independent rows, all scaled to norm 1. It replaces an independent row if
-# the coefficient of this row exceeds MAX_COEFFICIENT: so independent rows are less likely to become dependent during
-# the motion, as happens at dead centres. Coefficients of 1, which are common, must not cause exchanges
+# the coefficient of this row exceeds MAX_COEFFICIENT. Then the independent rows are farther from becoming dependent,
+# as rows do at dead centres. Coefficients of 1, which are common, must not cause exchanges
 MAX_COEFFICIENT = 1.5
 TIE_RATIO = 1.01  # coefficients count as equal up to this ratio, so that rounding errors do not choose among them
 ZERO_ENTRY = 1e-12  # entries up to this fraction of the largest in their row count as zero: they may be rounding errors
@@ -419,8 +418,8 @@ def _first_bound_below_pivots(S, kept, n_kept, largest_inverse, bounds, scratch)
 def _mark_independent_rows(G, min_sine, basis, factors, coefficients, C, kept, is_kept):
     """Set `is_kept` to 1 for the rows of G that `select_rows` selects, else to 0: these are redundant.
 
-    C[i, k] becomes the coefficient of independent row k in redundant row i, both scaled to norm 1. `basis`, `factors`,
-    `coefficients` and `kept` are scratch.
+    C[i, k] becomes the coefficient of independent row k in redundant row i, both scaled to norm 1. All other arrays
+    except G are scratch.
     """
     n_kept = select_rows(G, min_sine, basis, factors, kept)
     for k in range(len(G)):

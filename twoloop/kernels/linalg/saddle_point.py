@@ -4,8 +4,8 @@ M: mass matrix; G: independent rows of the constraint Jacobian; r: forces; c: gi
 
 - NULL_SPACE, for few degrees of freedom. Let G_d and G_i be the columns of G for dependent and for independent
   coordinates. The columns of T = [I; D^T], with D^T = -G_d^-1 G_i, are the velocities that the constraints allow. The
-  result is a = g + T x: g is the solution of G g = c whose independent entries are 0, and x solves
-  (T^T M T) x = T^T (r - M g). M need only be positive definite on the allowed velocities.
+  result is a = a_0 + T x: a_0 is the solution of G a_0 = c whose independent entries are 0, and x solves
+  (T^T M T) x = T^T (r - M a_0). M need only be positive definite on the allowed velocities.
 - MULTIPLIERS: first solve (G M^-1 G^T) lam = G M^-1 r - c, with the Schur complement G M^-1 G^T.
 - AUGMENTED: use sparse factors of the augmented matrix [M G^T; G 0], in which M is multiplied by w.mass_scale.
 """
@@ -119,7 +119,7 @@ def solve_by_reduced_mass(f, w, r, c, a):
         z[k] = c[rows[k]]
     solve_dependent(w.index_v, w.values_v, z)
     copy(r, a)
-    # `a` becomes r - M g, where G g = c: the dependent entries of g are z, and its independent entries are 0
+    # `a` becomes r - M a_0, where G a_0 = c: the dependent entries of a_0 are z, and the independent ones are 0
     for k in range(columns.size):
         column = columns[k]
         if f.diagonal_mass == 1:

@@ -60,7 +60,7 @@ def _fill_stiffness(program, mass, jacobian, stiffness, scratch):
 
 @merged
 def fill_saddle_matrix(program, mass, jacobian, values, stiffness, scratch):
-    """Store in `values` the matrix [M G^T; G 0] to be factored; add s g^T g to a singular M, see `_fill_stiffness`."""
+    """Store in `values` the matrix [M G^T; G 0]; to a singular M, add s g^T g (g: row of G; s: `_fill_stiffness`)."""
     for s in range(values.size):
         values[s] = 0.0
     _, _, slots = mass_entries_of(program)
@@ -82,8 +82,8 @@ def factor(program, is_independent, values, sizes, min_sine_square):
 
     The sine is that of the angle between a row of G and the span of previous rows. Its square is -pivot / (squared norm
     of the row); the squared norms are stored in `sizes`. On entry, `is_independent` is 0 for rows that count as
-    redundant. It becomes 0 for rows whose squared sine is at most `min_sine_square`. Rows with 0 are left out. If the
-    pivot of a coordinate is not positive (M is not positive definite), return NOT_DEFINITE.
+    redundant. It becomes 0 for rows whose squared sine is at most `min_sine_square`. Factors leave out rows with 0. If
+    the pivot of a coordinate is not positive (M is not positive definite), return NOT_DEFINITE.
     """
     (n_q, n) = program[N_COORDINATES], program[N_PIVOTS]
     order, runs = pivot_order_of(program), update_runs_of(program)

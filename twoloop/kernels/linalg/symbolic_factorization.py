@@ -331,8 +331,8 @@ def _update_runs(targets: Integers, diagonal: NDArray[np.bool_]) -> Integers:
     """Divide the elimination's updates of off-diagonal entries into ranges that change adjacent entries.
 
     `targets`: for each update, the index of the entry that it changes; `diagonal`: whether this entry is on the
-    diagonal. Return the length of each range and the index of the first entry that it changes. Ranges are long, as the
-    rows of a joint are adjacent in all columns: the processor changes vectors, and programs are a tenth as long.
+    diagonal. Return the length of each range and the index of its first entry. Ranges are long, because the rows of a
+    joint are adjacent in all columns: so entries are changed as vectors, and programs are a tenth as long.
     """
     off_diagonal = np.flatnonzero(~diagonal)
     begins = np.flatnonzero(diagonal[off_diagonal - 1] | (targets[off_diagonal] != targets[off_diagonal - 1] + 1))

@@ -45,7 +45,7 @@ def _error_constants():
     return np.abs(coefficients)
 
 
-# for equal steps; used as lower bounds, because constants of steps after a decrease of h are too small if a force jumps
+# error constants of equal steps, as lower bounds: after a decrease of h, actual ones hide errors where forces jump
 ERROR_CONSTANTS = _error_constants()
 
 THETA, N_OPTIONS = range(2)  # index in `options`: tolerance at which projections end, see `project`

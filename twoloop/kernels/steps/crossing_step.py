@@ -51,7 +51,8 @@ MIN_PIVOT_RATIO = 0.5  # a step fails if the pivot at its end is below this * pi
 END_MARGIN = 2.0  # a step fails if the pivot at its end is below this * smallest pivot allowed at nodes; see FAR_END
 FAR_END = 0.3  # no step fails if the smallest pivot of C_q at its end is at least this * largest pivot of the run
 LATE = S - 4  # node near the end: if the pivot is larger there than at the end, the end is before the singular position
-# an attempt that computes a polynomial returns this as error and as step-size factor: it is then repeated along it
+# an attempt that computes a polynomial returns this as error and as step-size factor. So the step is repeated; it then
+# follows the polynomial
 REPEAT_FACTOR = 2.0
 TINY = 1e-300  # lower bound of divisors that may be zero
 
@@ -417,7 +418,7 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
     code = _choose_partition_at_end(f, w, t + h, duration, stored, *min_pivots, tables, a, *states)
     if code != DONE:
         return Attempt(code, np.inf, 0.0)
-    if is_estimated:  # the next steps are pieces of this polynomial
+    if is_estimated:  # the next steps follow this polynomial
         stored[BEGIN], stored[DURATION], stored[END] = begin, duration, t + h
         return Attempt(DONE, REPEAT_FACTOR, REPEAT_FACTOR)
     copy(q1, q_stage)

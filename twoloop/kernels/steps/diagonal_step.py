@@ -295,7 +295,7 @@ def solve_stage(f, w, options, memory, t, h, A_stage):
     return DONE
 
 
-N_FILTERS = 3  # how often the difference from the embedded result is filtered; if less often, vibrations are unstable
+N_FILTERS = 3  # how often a difference from the embedded result is filtered; with fewer filters, vibrations may grow
 
 # if the accelerations a_k of the stages jump once, |sum_k jump_weights[k] a_k| is at most this fraction of their range.
 # If the fraction is smaller, `_error_at_jumps` reduces its estimate in proportion
