@@ -75,7 +75,7 @@ FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN, REACTION_BY_Q_GIVEN, MASS_VALUES_GIVEN = (
     CONTRADICTION,  # with the code ROWS_CONTRADICT: index of a violated row of [C_q; A]
     # smallest pivot of C_q, computed last (rows scaled to maxima of 1; fixed-order form: sine of an angle between rows)
     PIVOT,
-    # 1: the run has come near a singular position, or does not check for one; 2: near one, project stages; 0: else
+    # 1: the run has come near a singular position, or never checks for one; 2: near one, stages are projected; 0: else
     NEARLY_SINGULAR,
     NEAR_NOW,  # 1: a singular position was near at the last check; 2: the next check chooses a new partition; 0: else
     MASS_SCALE,  # factor by which M is multiplied in the augmented matrix, see linalg/saddle_point.py

@@ -19,7 +19,7 @@ from twoloop.kernels.evaluation.operations import result_of_operation
 from twoloop.kernels.linalg.dense import largest_of, ldl_factor
 
 NO_ENTRY = 1e-12  # an entry of C_q counts as zero if it is at most this fraction of the largest entry of its row
-MAX_SWEEPS = 20  # largest number of iterations in `column_units`; each fits the units of rows, then of columns
+MAX_SWEEPS = 20  # largest number of iterations in `column_units`; each fits the units of rows, then of coordinates
 NEGLIGIBLE = 1e-6  # `linear_ranges` ignores |q_j| if it is at most this fraction of the largest one in the same row
 
 
@@ -35,9 +35,10 @@ def _sort(values):
 
 @exact
 def _fit_column_units(rows, columns, mask, logs):
-    """Fit the units of coordinates, `columns`, to given units of rows, `rows`; return True if no unit changed.
+    """Fit the units of coordinates to given units of rows, see `column_units`; return True if no unit changed.
 
-    Units are logarithms; `logs` contains log|entry| of C_q. `mask`: 0 where an entry of C_q counts as zero, else 1.
+    `columns`, `rows` and `logs` contain logarithms: of the units of coordinates and rows, and of |entries| of C_q.
+    `mask`: 0 where an entry of C_q counts as zero, else 1.
     """
     is_unchanged = True
     for j in range(columns.size):
@@ -54,7 +55,7 @@ def _fit_column_units(rows, columns, mask, logs):
 
 @exact
 def _fit_row_units(columns, rows, mask, logs):
-    """Fit the logarithms of row units, `rows`, to those of coordinate units, `columns`; see `_fit_column_units`."""
+    """Fit the units of rows to given units of coordinates; for the arguments see `_fit_column_units`."""
     for i in range(rows.size):
         total, n = 0.0, 0
         for j in range(columns.size):
@@ -69,8 +70,8 @@ def column_units(matrix, typical, columns, mask, logs, rows, scratch):
     """Store in `columns` (n_q) units of the coordinates in which the entries of C_q (`matrix`) have similar sizes.
 
     The units minimize the sum of log(|entry (i, j)| * unit of coordinate j / unit of row i)^2 over all nonzero entries.
-    This leaves a common factor free, which is chosen so that the median ratio of units to `typical` (n_q, typical sizes
-    of the coordinates) is 1. A coordinate without nonzero entries gets the unit `typical`. Other arguments are scratch.
+    This leaves a common factor free, which is chosen so that the median of unit / typical size is 1 (`typical`: n_q
+    typical sizes of coordinates). Coordinates without nonzero entries get their typical size. Other arguments: scratch.
     """
     n_used, log_factor = 0, 0.0
     for i in range(rows.size):
@@ -102,12 +103,12 @@ def column_units(matrix, typical, columns, mask, logs, rows, scratch):
 
 @kernel(types.void(MATRIX, VECTOR, f8, VECTOR, VECTOR))
 def linear_ranges(coordinates_in_units, radius, negligible, scratch, ranges):
-    """Store in `ranges` the distance over which each row of C_q changes little, in units of the coordinates.
+    """Store in `ranges` how far coordinates can move, in their units, before each row of C_q changes much.
 
     Row i of `coordinates_in_units` contains |q_j| in its unit where row i of C_q has a nonzero entry j, else 0.
-    `radius`: norm of each row, divided by its change per unit displacement. If this radius is at most 1, or at most the
-    largest |q_j| of the row, the distance is the radius. Else it is 1 if no |q_j| of the row exceeds the argument
-    `negligible`, or the lower median of the row's |q_j|, without those up to NEGLIGIBLE times the largest.
+    `radius`: norm of each row / change of the row per unit displacement. A radius of at most 1, or at most the largest
+    |q_j| of the row, is the range. For larger radii, the range is the lower median of those |q_j| of the row that
+    exceed NEGLIGIBLE times the largest one; or 1, if no |q_j| of the row exceeds the argument `negligible`.
     """
     for i in range(ranges.size):
         largest, n = 0.0, 0
@@ -129,7 +130,7 @@ def linear_ranges(coordinates_in_units, radius, negligible, scratch, ranges):
 # CONSISTENT: the state satisfies the constraints up to rounding. Only for a varying M, with L = roundings[2] max|M_ij|:
 # DEFINITE if all eigenvalues of M exceed L * EIGENVALUE_MARGIN; INDEFINITE if one is below L / EIGENVALUE_MARGIN
 WELL_FORMED, CONSISTENT, DEFINITE, INDEFINITE = 1, 2, 4, 8
-MAX_RELATIVE_DISTANCE = 0.5  # recorded sizes apply to q if each |q_j - recorded q_j| is at most this part of the size
+MAX_RELATIVE_DISTANCE = 0.5  # sizes recorded at a position hold at q if |q_j - recorded q_j| is at most this part
 ROUNDING_OF_ZERO = 2.0**-52  # a coordinate up to this fraction of the largest one may be zero with a rounding error
 EIGENVALUE_MARGIN = 2.0  # if the least eigenvalue of M is within this factor of its limit, a check in Python decides
 
@@ -156,7 +157,7 @@ def _has_empty_row(rows):
 
 @exact
 def _is_symmetric(mass, tolerance):
-    """Return whether M is symmetric, up to differences of `tolerance` times max|M_ij|."""
+    """Return True if M is symmetric, up to differences of `tolerance` times max|M_ij|."""
     largest, asymmetry, is_exactly_symmetric = 0.0, 0.0, True
     for i in range(len(mass)):
         for j in range(i):
@@ -173,7 +174,7 @@ def _is_symmetric(mass, tolerance):
 def _is_rounding_error(value, row, state, sizes, min_size, rate, tolerance):
     """Return True if `value`, the violation of a constraint, is at most `tolerance` times the sum of its |terms|.
 
-    The terms are `rate` and row[j] * state[j] for all j, where |state[j]| counts as at least sizes[j] and `min_size`.
+    Terms: `rate`, and row[j] * state[j] for all j, where sizes[j] or `min_size` replaces |state[j]| if it is larger.
     """
     sum_of_terms = abs(rate)
     for j in range(state.size):
@@ -184,7 +185,7 @@ def _is_rounding_error(value, row, state, sizes, min_size, rate, tolerance):
 
 @exact
 def _is_near(q, sizes, stored_q):
-    """Return whether |q_j - stored_q[j]| is at most MAX_RELATIVE_DISTANCE times sizes[j] for each coordinate j."""
+    """Return True if |q_j - stored_q[j]| is at most MAX_RELATIVE_DISTANCE times sizes[j] for each coordinate j."""
     is_near = True
     for j in range(q.size):
         is_near = is_near and abs(q[j] - stored_q[j]) <= MAX_RELATIVE_DISTANCE * sizes[j]
@@ -193,7 +194,7 @@ def _is_near(q, sizes, stored_q):
 
 @exact
 def _has_same_entries(rows, entries):
-    """Return whether `rows` and `entries`, a matrix stored row by row, have nonzero entries at the same places."""
+    """Return True if `rows` and `entries`, a matrix stored row by row, have nonzero entries at the same places."""
     is_same, n = True, rows.shape[1]
     for i in range(entries.size // n):
         largest = largest_of(rows[i])
@@ -217,9 +218,9 @@ def _index_of_near_position(q, rows, n_c, records):
 
 @exact
 def _is_consistent(C, rate, rows, q, v, records, tolerance):
-    """Return whether (q, v) satisfies the constraints up to rounding errors; `rows`: [C_q; A], `rate`: C_t and b.
+    """Return True if (q, v) satisfies the constraints up to rounding errors; `rows`: [C_q; A], `rate`: C_t and b.
 
-    A violation is compared with the terms of its constraint. For this, the size of a coordinate counts as at least its
+    A violation is compared with the terms of its constraint. In these, the size of a coordinate counts as at least its
     size in `records` (see `evaluate_start`), and at least the rounding error of the largest coordinate. Else a
     constraint on coordinates that are zero up to rounding, such as those normal to a plane of motion, seems violated.
     """
@@ -248,7 +249,7 @@ def _record_entries(rows, pattern):
 
 @exact
 def _is_definite(mass, min_eigenvalue, factors):
-    """Return whether all eigenvalues of M exceed `min_eigenvalue` times max|M_ij|; `factors` is scratch."""
+    """Return True if all eigenvalues of M exceed `min_eigenvalue` times max|M_ij|; `factors` is scratch."""
     n, largest = len(mass), 0.0
     for i in range(n):
         for j in range(n):
@@ -261,7 +262,7 @@ def _is_definite(mass, min_eigenvalue, factors):
 
 @kernel(i8(KIT, f8, VECTOR, VECTOR, VECTOR, VECTOR, VECTOR, MATRIX, MATRIX, MATRIX, MATRIX, VECTOR), vectorized=True)
 def evaluate_start(f, t, q, v, records, lam, results, mass, rows, shifts, pattern, roundings):
-    """Evaluate all callbacks at (t, q, v), and store their results; return the sum of the flags that apply.
+    """Evaluate all callbacks at the start (t, q, v), and store their results; return the sum of the flags that apply.
 
     The flags are WELL_FORMED, CONSISTENT, DEFINITE and INDEFINITE; 0 if a value is not finite. Arguments:
 
@@ -336,7 +337,7 @@ def evaluate_start(f, t, q, v, records, lam, results, mass, rows, shifts, patter
 
 @kernel(types.void(KIT, f8, MATRIX, i8, MATRIX))
 def rows_at_positions(f, t, positions, n_c, rows):
-    """Store in `rows` (zero on entry) C_q (n_c rows) and A at the first of `positions`, then at the second, ..."""
+    """Store C_q (n_c rows) and A in `rows` (zero on entry): first those at positions[0], then at positions[1], ..."""
     n_rows = len(rows) // len(positions)
     for k in range(len(positions)):
         begin = k * n_rows
@@ -346,7 +347,7 @@ def rows_at_positions(f, t, positions, n_c, rows):
 
 @exact
 def _is_close(fused, separate, tolerance, rounding_errors):
-    """Return whether all entries (i, j) of two matrices agree up to tolerance * max|separate| + rounding_errors[i]."""
+    """Return True if all entries (i, j) of two matrices agree up to tolerance * max|separate| + rounding_errors[i]."""
     largest = 0.0
     for i in range(separate.shape[0]):
         for j in range(separate.shape[1]):
@@ -360,7 +361,7 @@ def _is_close(fused, separate, tolerance, rounding_errors):
 
 @kernel(types.boolean(KIT, f8, VECTOR, VECTOR, MATRIX, MATRIX, VECTOR, f8, f8))
 def kinematics_agree(f, t, q, v, fused, separate, roundings, tolerance, rounding):
-    """Return whether the callback `kinematics` agrees with the callbacks for C, C_t, gamma and C_q.
+    """Return True if the callback `kinematics` agrees with the separate callbacks for C, C_t, gamma and C_q.
 
     Differences of up to `tolerance` times the largest value of each of the four are allowed; for C_i, also `rounding`
     times the sum of |C_q[i, j] q_j| over j. On return, `fused` (by `kinematics`) and `separate` (by the others) contain
@@ -389,12 +390,12 @@ VALUE, BOUND = range(2)  # rows of the array `nodes`: results of a trace's opera
 EPS = 2.0**-52
 # largest allowed difference of a callback and its trace, apart from rounding, relative to the callback's largest value
 MAX_DIFFERENCE = 1e-9
-ROUNDING_FACTOR = 200.0 * EPS  # allowed rounding error of a number from a trace, divided by its entry in `bounds`
+ROUNDING_FACTOR = 200.0 * EPS  # allowed rounding error of a number from a trace, divided by its bound in `bounds`
 
 
 @exact
 def _sum_with_bound(columns, coefficients, constant, nodes, begin, end):
-    """Return constant + sum of coefficients[k] * nodes[VALUE, columns[k]], begin <= k < end; and its rounding bound."""
+    """Return constant + sum of coefficients[k] * nodes[VALUE, columns[k]] for begin <= k < end, and its error bound."""
     total, bound = constant, abs(constant)
     for k in range(begin, end):
         term = coefficients[k] * nodes[VALUE, columns[k]]
@@ -405,7 +406,7 @@ def _sum_with_bound(columns, coefficients, constant, nodes, begin, end):
 
 @exact
 def _operation_with_bound(kind, x, bound_x, y, bound_y):
-    """Return the result of the operation `kind` on x and y; and its rounding bound, given those of x and y."""
+    """Return the result of an operation (`kind`) on x and y, and its error bound, given the bounds of x and y."""
     z = result_of_operation(kind, x, y)
     if kind == op.PRODUCT:
         bound = abs(x) * bound_y + abs(y) * bound_x
@@ -430,7 +431,7 @@ def _run_trace(program, columns, coefficients, constants, nodes, values, bounds)
     """Run a trace: store its results in `values`, and bounds of their rounding errors, in units of EPS, in `bounds`.
 
     `program`, `columns`, `coefficients` and `constants` describe its operations. On entry, `nodes` begins with t, q and
-    v; the results of all operations are added to it.
+    v; the results of all operations are stored behind them.
     """
     for i in range(len(program)):
         first, second, end = program[i, op.FIRST], program[i, op.SECOND], program[i, op.END]

@@ -1,8 +1,8 @@
-"""Evaluate the rows G = [C_q; A] of the constraints, their rates C_t and b, and Gamma by finite differences.
+"""Evaluate the constraint Jacobian G = [C_q; A], the constraint rates C_t and b, and Gamma by finite differences.
 
 C_q belongs to constraints C(t, q) = 0, A to constraints A v + b = 0, so that G v + (C_t, b) = 0. The derivative of this
 equation along the motion is G a = Gamma for accelerations a. Two central differences, with the time steps e and 2 e,
-yield Gamma to order 4. Their disagreement estimates the error, by which e is chosen (`f`: kit, `w`: workspace).
+yield Gamma to order 4. Their difference estimates the error, by which e is chosen (`f`: kit, `w`: workspace).
 """
 
 import numpy as np
@@ -25,7 +25,7 @@ def constraint_rows(f, w, t, q, G):
 
 @merged
 def clear_rows(f, w):
-    """Set the constraint Jacobian w.G to zero; in the augmented form, only the entries listed in w.row_entries."""
+    """Set the constraint Jacobian w.G to zero; in the augmented form, only its nonzero entries, see w.row_entries."""
     if f.form == AUGMENTED:
         for i in range(w.Rate.size):  # the task VERIFY_PATTERN detects nonzero entries elsewhere
             for k in range(w.row_entries[i], w.row_entries[i + 1]):
@@ -36,7 +36,7 @@ def clear_rows(f, w):
 
 @merged
 def row_residual(w, v, rows):
-    """Store in w.z the violations G v + (C_t, b) of constraints `rows` by velocities v; w contains G, C_t and b."""
+    """Store in w.z the violations G v + (C_t, b), in these `rows`, by velocities v; w contains G, C_t and b."""
     for k in range(rows.size):
         row = rows[k]
         total = w.Rate[row]
@@ -73,7 +73,7 @@ def kinematics(f, w, t, q, v):
 
 @merged
 def gather_independent_columns(G, rate, rows, independent, D):
-    """Store in row j of D the column -G[rows, independent[j]], in its last row -rate[rows]: as right-hand sides."""
+    """Store right-hand sides for the null space, D: -G[rows, independent[j]] in row j; -rate[rows] in the last."""
     for j in range(independent.size):
         column = independent[j]
         for k in range(rows.size):
@@ -85,13 +85,14 @@ def gather_independent_columns(G, rate, rows, independent, D):
 # `largest_difference_step` is at most MAX_DIFFERENCE_STEP (s) and, in fast motion, at least MIN_STEP_RATIO times this
 MAX_DIFFERENCE_STEP, MIN_STEP_RATIO = 2e-4, 1e-4
 N_DIFFERENCE_STEPS = 12  # number of time steps that `_choose_difference_step` tries, each a quarter of the previous one
-ROUNDING_DISAGREEMENT = 1e-9  # differences of Gamma with steps e and 2 e up to this part of its size count as rounding
-# if Gamma with time steps e and 2 e differs by less than this part of its size, e is doubled to reduce rounding errors
+# if Gamma with the time step e differs from Gamma with 2 e by at most this part of its size, rounding may be the reason
+ROUNDING_DISAGREEMENT = 1e-9
+# if Gamma with the time step e differs from Gamma with 2 e by less than this part of its size, e is doubled
 NEGLIGIBLE_DISAGREEMENT = 1e-11
-# weights of values at the times 0, e, 2 e and 4 e in one-sided differences of order 2; COARSE: with the step 2 e
+# weights of values at the times 0, e, 2 e and 4 e in one-sided differences of order 2; COARSE: with the time step 2 e
 ONE_SIDED_WEIGHTS, ONE_SIDED_WEIGHTS_COARSE = (-1.5, 2.0, -0.5, 0.0), (-0.75, 0.0, 1.0, -0.25)
 ONE_SIDED_STEP_RATIO = 1.0 / 16.0  # ratio of the time step of one-sided differences to that of central differences
-# assumed rounding error of Gamma if terms of G v cancel, divided by (largest |term| / largest time step); G: Jacobian
+# assumed rounding error of Gamma, divided by (largest |G_ij v_j| / largest time step); G: constraint Jacobian
 ROUNDING_OF_TERMS = 1e-14
 CONVERGED_CHANGE = 0.01  # the search for a time step ends if Gamma changes by at most this part of its allowed error
 
@@ -104,9 +105,9 @@ def representable_step(t, h):
 
 @merged
 def largest_difference_step(q, v):
-    """Return the largest time step e (s) of finite differences: MAX_DIFFERENCE_STEP, or less if coordinates move fast.
+    """Return the largest time step (s) of finite differences: MAX_DIFFERENCE_STEP, or less if coordinates move fast.
 
-    In the time e, they move by at most MAX_DIFFERENCE_STEP / (1 s) times max|q|, unless MIN_STEP_RATIO limits e.
+    In this time, they move by at most MAX_DIFFERENCE_STEP / (1 s) times max|q|, unless MIN_STEP_RATIO limits the step.
     """
     size, speed = largest_of(q), largest_of(v)
     if speed <= size:
@@ -116,7 +117,7 @@ def largest_difference_step(q, v):
 
 @merged
 def _difference_side(w, t, e):
-    """Return 0 if C_t and b do not jump within 2 e of t; else the side farther from a jump, 1 (after t) or -1."""
+    """Return the side of t on which to take differences: 0 (both) or, if C_t or b jumps near, 1 (after t) or -1."""
     since_jump, until_jump = t - w.last_jump, w.next_jump - t
     if min(since_jump, until_jump) >= 2.0 * e:
         return 0.0
@@ -125,10 +126,10 @@ def _difference_side(w, t, e):
 
 @compiled
 def _fill_gamma(f, w, t, q, v, e, first, last):
-    """Store Gamma[first:last] in w.Gamma, extrapolated from differences with the time steps e and 2 e; return 3 maxima.
+    """Store Gamma[first:last] in w.Gamma, extrapolated from differences with the time steps e and 2 e.
 
-    They are the largest |Gamma_i|, the largest difference between both values of Gamma_i, and the largest |G_ij v_j|.
-    If Gamma is not finite, the first two are NaN.
+    Return the largest |Gamma_i|, the largest |difference| of Gamma_i with both time steps, and the largest |G_ij v_j|
+    (G: constraint Jacobian). If Gamma is not finite, the first two are NaN.
     """
     Gamma_coarse = w.Gamma_tried[0]
     side = _difference_side(w, t, e)
@@ -170,7 +171,7 @@ def _fill_gamma(f, w, t, q, v, e, first, last):
 
 @merged
 def _max_disagreement(w):
-    """Return the limit of the difference between Gamma with time steps e and 2 e; the error of Gamma is smaller."""
+    """Return how much Gamma with the time step e may differ from Gamma with 2 e; its error is smaller than this."""
     return max(w.gamma_required, ROUNDING_DISAGREEMENT) * w.gamma_scale
 
 
@@ -178,9 +179,9 @@ def _max_disagreement(w):
 def _choose_difference_step(f, w, t, q, v, largest_step, first, last):
     """Store Gamma[first:last] in w.Gamma, by differences with the best of several time steps e.
 
-    Beginning with `largest_step`, e is divided by 4 until Gamma changes little. The best e is the one at which Gamma
-    changes least. Its ratio to `largest_step` is stored in w.gamma_step_ratio. Return GAMMA_INACCURATE if even this
-    least change is larger than the allowed error, else DONE.
+    Beginning with `largest_step`, divide e by 4 until Gamma changes little. The best e is the one with the least change
+    of Gamma. Store its ratio to `largest_step` in w.gamma_step_ratio. Return GAMMA_INACCURATE if even the least change
+    exceeds the allowed error, else DONE.
     """
     least_change = np.inf
     step_ratio = 1.0
@@ -211,10 +212,9 @@ def _choose_difference_step(f, w, t, q, v, largest_step, first, last):
 def gamma_by_differences(f, w, t, q, v, first, last):
     """Store Gamma[first:last] in w.Gamma, by differences; return DONE, or GAMMA_INACCURATE if no time step is accurate.
 
-    Gamma = -d/de [G v + (C_t, b)](t + e, q + e v) at e = 0, where v is constant.
-
-    Errors are relative to w.gamma_scale, the largest Gamma so far. The time step e is w.gamma_step_ratio times
-    `largest_difference_step`. If Gamma with e and 2 e differ too much, as with kilohertz drives, choose a new ratio.
+    Gamma = -d/de [G v + (C_t, b)](t + e, q + e v) at e = 0, where v is constant. Errors are relative to w.gamma_scale,
+    the size of Gamma so far. The time step e is w.gamma_step_ratio times `largest_difference_step`. If Gamma with e and
+    Gamma with 2 e differ too much, as with kilohertz drives, a new ratio is chosen.
     """
     largest_step = largest_difference_step(q, v)
     e = representable_step(t, w.gamma_step_ratio * largest_step)

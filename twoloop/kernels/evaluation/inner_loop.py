@@ -5,10 +5,10 @@ end of this file, one for each task. Accelerations a and multipliers lam follow 
 M a + G^T lam = Q (Q: forces), G a = Gamma. G = [C_q; A] contains the Jacobian C_q of constraints on positions and the
 rows A of non-holonomic constraints A v + b = 0; w.D contains the null space of G. `w` is the workspace.
 
-If a step integrates all coordinates, its states violate the constraints by the error of the formula. Each pass of a
-projection moves positions and velocities towards the nearest state on the constraints, in the metric of M. This state
-does not depend on a partition. After a pass, the error of positions is about the square of their correction. The errors
-of velocities and accelerations are about as large as the correction: passes are repeated until it is near rounding.
+If a step integrates all coordinates, its states violate the constraints by the error of the formula. Each iteration of
+a projection moves q and v towards the nearest state on the constraints, in the metric of M. This state does not depend
+on a partition. After it, the error of q is about the square of its correction, but the errors of v and a are about as
+large as the correction: iterations are repeated until the correction is near rounding.
 """
 
 import numpy as np
@@ -58,7 +58,7 @@ def compute_gamma(f, w, t, q, v):
     if w.has_gamma == 1.0 and n_rows == n_c:
         return DONE
     has_gamma, has_gamma_a = f.gamma_given == 1, f.nonholonomic_gamma_given == 1
-    first, last = 0, n_rows  # no callback is given for rows `first` to `last` - 1 of Gamma
+    first, last = 0, n_rows  # the user gives no callback for rows `first` to `last` - 1 of Gamma
     w.Gamma[:] = 0.0
     if has_gamma:
         f.gamma(t, q, v, f.p, w.Gamma[:n_c])
@@ -76,14 +76,14 @@ def compute_gamma(f, w, t, q, v):
 
 @merged
 def mass_matrix(f, w, t, q):
-    """Store M(t, q) in w.M."""
+    """Store the mass matrix M(t, q) in w.M."""
     w.M[:, :] = 0.0
     f.mass(t, q, f.p, w.M)
 
 
 @merged
 def factor_mass_at(f, w, t, q):
-    """Store M(t, q) in w.M and, if the form f.form uses them, its factors in w.L; return DONE or a failure code."""
+    """Store the mass matrix in w.M and, if f.form needs them, its factors in w.L; return DONE or a failure code."""
     w.factored = 0.0
     mass_matrix(f, w, t, q)
     code = factor_mass(f, w) if f.form == MULTIPLIERS or has_banded_mass(f) else DONE
@@ -92,7 +92,7 @@ def factor_mass_at(f, w, t, q):
 
 @merged
 def factor_equations_at(f, w, t, q):
-    """Factor the equations for accelerations, given Jacobian w.G and null space w.D; return DONE or a failure code."""
+    """Factor M a + G^T lam = Q, G a = Gamma, given Jacobian G and null space in w; return DONE or a failure code."""
     if f.constant_mass == 0:
         w.factored = 0.0
         mass_matrix(f, w, t, q)
@@ -104,7 +104,7 @@ def factor_equations_at(f, w, t, q):
 
 @merged
 def compute_accelerations(f, w, t, q, v, a):
-    """Store accelerations at (q, v) in `a`, after `_factor_rows_at` for the same q; return DONE or a failure code."""
+    """Store accelerations at (q, v) in `a`, with factors by `_factor_rows_at` in w; return DONE or a failure code."""
     w.n_evaluations += 1
     code = factor_equations_at(f, w, t, q)
     if code == DONE:
@@ -125,7 +125,7 @@ def compute_accelerations(f, w, t, q, v, a):
 
 @compiled
 def _record_gamma_scale(w, a):
-    """Raise w.gamma_scale, the size of Gamma, to the largest sum over j of |G_ij a_j| (G: constraint Jacobian)."""
+    """Raise w.gamma_scale, the size of Gamma, to the largest sum over j of |G_ij a_j|, unless larger (G: Jacobian)."""
     for i in range(w.Rate.size):
         total = 0.0
         for p in range(w.row_entries[i], w.row_entries[i + 1]):
@@ -135,7 +135,7 @@ def _record_gamma_scale(w, a):
 
 @merged
 def compute_multipliers(f, w, a, lam):
-    """Store in lam the multipliers with G^T lam = Q - M a (G: Jacobian; Q: forces), of least norm if not unique."""
+    """Store in lam the solution of G^T lam = Q - M a (G: Jacobian, Q: forces): the shortest, if there are several."""
     lam[:] = 0.0
     saddle_point.multipliers(f, w, w.Q, a, lam)
     if w.rows_v.size < lam.size:
@@ -144,10 +144,9 @@ def compute_multipliers(f, w, a, lam):
 
 @merged
 def _factor_rows_at(f, w, t, q, v):
-    """Store in w the constraint Jacobian at q and the factors of its dependent columns; return DONE or a failure code.
+    """Store the constraint Jacobian at q and factors of its dependent columns in w; return DONE or a failure code.
 
     In the form NULL_SPACE, also store its null space; with the callback `kinematics`, also Gamma at (q, v).
-    The state (q, v) may violate the constraints.
     """
     if f.kinematics_given == 1:
         kinematics(f, w, t, q, v)
@@ -169,7 +168,7 @@ def compute_accelerations_at(f, w, t, q, v, a):
 
 @merged
 def _find_least_correction(f, w):
-    """Store in w.y the x with G x = w.g (G: Jacobian) and least x^T M x; return max|x|, or inf if it is not finite."""
+    """Store in w.y the solution x of G x = w.g (G: Jacobian) with least x^T M x; return max|x|; inf if not finite."""
     w.Q[:] = 0.0
     solve(f, w, w.Q, w.g, w.y)
     largest = 0.0
@@ -182,7 +181,7 @@ def _find_least_correction(f, w):
 
 @merged
 def _find_corrections(f, w, v):
-    """Correct v in place, and store the correction of q in w.y; return the largest |correction| of q, and that of v."""
+    """Correct v, but only store the correction of q, in w.y; return the largest |correction| of q, and that of v."""
     rows, n_c = w.rows_v, w.C.size
     row_residual(w, v, rows)
     for i in range(rows.size):
@@ -201,9 +200,9 @@ def project_state(f, w, t, q, v, theta, a, lam):
 
     q and v change in place. Corrections x of q satisfy A x = 0, where A are the rows of non-holonomic constraints.
 
-    Passes end after one that corrects positions by at most theta, and velocities by at most theta max(1, max|v|). They
-    also end after one that corrects positions by at most theta times w.pivot, the smallest pivot of C_q. Velocities are
-    then accurate, too: the directions that constraints allow turn at most at a rate of about 1 / w.pivot.
+    Iterations end after one that corrects q by at most theta, and v by at most theta max(1, max|v|). They also end
+    after one that corrects q by at most theta times w.pivot, the smallest pivot of C_q. Then v is accurate, too: per
+    unit of displacement, the directions that constraints allow turn by about 1 / w.pivot at most.
     """
     last_correction = np.inf
     theta = max(theta, MIN_CORRECTION * w.rounded)
@@ -247,9 +246,9 @@ ROUNDING_OF_Q = 2e-14  # a change of q by at most this fraction of max|q| counts
 
 @merged
 def _verify_pattern(w):
-    """Return DONE if w.pattern is 1 for all nonzero entries of w.G; else write programs of elimination for all entries.
+    """If the constraint Jacobian w.G has nonzero entries where w.pattern is 0, write new programs of elimination.
 
-    Return INNER_DIVERGED after new programs, so that the caller repeats the step; SINGULAR if none can be written.
+    Return DONE if it has none, INNER_DIVERGED after new programs, so that the step is repeated, or SINGULAR on failure.
     """
     if not record_entries(w):
         return DONE
@@ -258,7 +257,7 @@ def _verify_pattern(w):
 
 @compiled
 def _do_task_between_evaluations(f, w, task, t, q, v):
-    """Do a task (see tasks.py) that chooses a partition, factors or checks something; return DONE or a failure code."""
+    """Do a task (see tasks.py) other than evaluating or projecting a state; return DONE or a failure code."""
     if task == tasks.FIND_NULL_SPACE:
         code = evaluate_and_factor_columns(f, w, t, q)
         if code == DONE:
@@ -277,7 +276,7 @@ def _do_task_between_evaluations(f, w, task, t, q, v):
 
 @kernel(INNER)
 def inner_loop(f, w, task, t, q, v, tolerance, a, lam):
-    """Do a task (see tasks.py) at (t, q, v); return DONE or a failure code. Functions below explain the tasks."""
+    """Do a task at (t, q, v); return DONE or a failure code. Each task has a function below, which explains it."""
     if task >= tasks.FIND_NULL_SPACE:
         return _do_task_between_evaluations(f, w, task, t, q, v)
     if task in (tasks.EVALUATE, tasks.EVALUATE_WITHOUT_PROJECTION) and w.time_is_up == 1.0:
@@ -309,7 +308,8 @@ def inner_loop(f, w, task, t, q, v, tolerance, a, lam):
 def evaluate(f, w, t, q, v, tolerance, a):
     """Compute dependent from independent entries of q and v, and the accelerations `a`; return DONE or a failure code.
 
-    The last correction of q is at most `tolerance`. The Jacobian factored last is used: at q, or up to w.reuse from it.
+    Newton's method for q ends after a correction of at most `tolerance`. The Jacobian may be that before the last
+    correction if this was at most w.reuse.
     """
     return f.inner(f, w, tasks.EVALUATE, t, q, v, tolerance, a, w.lam)
 
@@ -318,7 +318,7 @@ def evaluate(f, w, t, q, v, tolerance, a):
 def evaluate_state(f, w, t, q, v, tolerance, a, lam):
     """Compute dependent entries of q and v, accelerations `a` and multipliers lam; return DONE or a failure code.
 
-    Dependent entries are accurate up to rounding, as needed at ends of steps; for other states, `evaluate` is faster.
+    Dependent entries are accurate up to rounding, as needed at ends of steps. For stages, `evaluate` is faster.
     """
     return f.inner(f, w, tasks.EVALUATE_STATE, t, q, v, tolerance, a, lam)
 
@@ -331,7 +331,7 @@ def evaluate_without_projection(f, w, t, q, v, a):
 
 @merged
 def project(f, w, t, q, v, theta, a, lam):
-    """Project (q, v) onto the constraints, in place; `theta`: limit of the last correction of q; return a code."""
+    """Project (q, v) onto the constraints, in place, by `project_state`; store `a` and lam; return a code."""
     code = f.inner(f, w, tasks.PROJECT, t, q, v, theta, a, lam)
     if code == DONE and has_new_entries(w.G, w.pattern):
         code = f.inner(f, w, tasks.VERIFY_PATTERN, t, q, v, theta, a, lam)
@@ -340,19 +340,19 @@ def project(f, w, t, q, v, theta, a, lam):
 
 @merged
 def restore_constraints(f, w, t, q, v, tolerance):
-    """Compute dependent from independent entries of q and v; `tolerance`: limit of corrections of q; return a code."""
+    """Compute dependent entries of q, up to a last correction of `tolerance`, and of v; return a code."""
     return f.inner(f, w, tasks.RESTORE, t, q, v, tolerance, w.x, w.lam)
 
 
 @merged
 def accelerations(f, w, t, q, v, a, lam):
-    """Store `a` and lam at the state (q, v) from `restore_constraints`, called last; return DONE or a failure code."""
+    """Store `a` and lam at (q, v), the state that `restore_constraints` has just computed; return a code."""
     return f.inner(f, w, tasks.ACCELERATIONS, t, q, v, 0.0, a, lam)
 
 
 @merged
 def multipliers(f, w, t, q, v, a, lam):
-    """Store the multipliers lam that belong to `a`, the accelerations evaluated last; return DONE or a failure code."""
+    """Store the multipliers lam that belong to the accelerations `a` evaluated last; return DONE or a failure code."""
     return f.inner(f, w, tasks.MULTIPLIERS, t, q, v, 0.0, a, lam)
 
 
@@ -364,19 +364,19 @@ def find_tangents(f, w, t, q):
 
 @merged
 def prepare_mass(f, w, t, q):
-    """Store M(t, q) in w and, if the form f.form uses them, its factors; return DONE or a failure code."""
+    """Store the mass matrix in w and, if the form f.form uses them, its factors; return DONE or a failure code."""
     return f.inner(f, w, tasks.PREPARE_MASS, t, q, q, 0.0, w.x, w.lam)
 
 
 @merged
 def renew_partition(f, w, t, q):
-    """Choose a partition at a consistent q; store sign(det C_qd) in w (C_qd: dependent columns); return a code."""
+    """Choose a partition at a consistent q, and store sign(det C_qd) (dependent columns of C_q) in w; return a code."""
     return f.inner(f, w, tasks.RENEW_PARTITION, t, q, q, 0.0, w.x, w.lam)
 
 
 @merged
 def adopt_midpoint_partition(f, w, t_mid, state, new_state):
-    """Choose the partition for the middle of a step by `adopt_partition_of_midpoint` and return its code."""
+    """Do `adopt_partition_of_midpoint`, which chooses a partition at the middle of a step; return its code."""
     return f.inner(f, w, tasks.ADOPT_MIDPOINT, t_mid, state, new_state, 0.0, w.x, w.lam)
 
 
@@ -388,13 +388,13 @@ def check_redundant_rows(f, w, t, q, v):
 
 @merged
 def rounding_floor(q):
-    """Return the largest change of q that may be a rounding error; after such a change, an iteration has converged."""
+    """Return the largest change of q that may be a rounding error: after such a change, an iteration has converged."""
     return max(ROUNDING_OF_CORRECTIONS, ROUNDING_OF_Q * largest_of(q))
 
 
 @kernel(INNER)
 def generated_inner_loop(f, w, task, t, q, v, theta, a, lam):
-    """Do a task by generated code or, if this is missing or fails, by the general inner loop; return a code."""
+    """Do a task by generated code or, if this is missing or fails, by `f.general`, for any mechanism; return a code."""
     if task == tasks.EVALUATE_WITHOUT_PROJECTION:
         w.n_evaluations += 1
         w.n_factorizations += 1
@@ -425,7 +425,7 @@ def generated_inner_loop(f, w, task, t, q, v, theta, a, lam):
     elif task == tasks.CHECK_REDUNDANT and w.used_general == 0.0:
         if f.own_redundant(t, q, v, f.numbers, a):
             return DONE
-        f.general(f, w, tasks.FIND_NULL_SPACE, t, q, v, theta, a, lam)  # stores G at q, which the check needs, in w
-    elif task <= tasks.MULTIPLIERS:  # these tasks use a partition, and there is no generated code for them
+        f.general(f, w, tasks.FIND_NULL_SPACE, t, q, v, theta, a, lam)  # stores the Jacobian, for the check below, in w
+    elif task <= tasks.MULTIPLIERS:  # these tasks use a partition: there is no generated code for them
         w.used_general = 1.0
     return f.general(f, w, task, t, q, v, theta, a, lam)
