@@ -46,7 +46,7 @@ class _DisjointSets:
         return i
 
     def join(self, i: int, j: int) -> int:
-        """Merge the sets that contain i and j; return the smallest member."""
+        """Merge the sets that contain i and j; return the smallest member of their union."""
         i, j = self.find(i), self.find(j)
         self.parent[max(i, j)] = min(i, j)
         return min(i, j)

@@ -45,7 +45,7 @@ def _error_constants():
     return np.abs(coefficients)
 
 
-# error constants of equal steps, as lower bounds: after a decrease of h, actual ones hide errors where forces jump
+# for equal steps; lower bounds in unequal ones: after a decrease of h, actual constants hide errors where forces jump
 ERROR_CONSTANTS = _error_constants()
 
 THETA, N_OPTIONS = range(2)  # index in `options`: tolerance at which projections end, see `project`
@@ -56,7 +56,7 @@ THETA, N_OPTIONS = range(2)  # index in `options`: tolerance at which projection
     ORDER,  # order of the next attempt
     DEPTH,  # number of accelerations in the history, at most N_TERMS
     AGE,  # number of accepted steps since the last change of the order or the last rejected step
-    STARTING,  # 1: the run begins, and the order rises with every step; 0: error estimates choose the order
+    STARTING,  # 1: the history has just begun, and the order rises with every step; 0: error estimates choose the order
     FAILED,  # number of successive rejected attempts
     NEXT_ORDER,  # order chosen at the end of an attempt for the next one
     N_SCALARS,
@@ -168,7 +168,7 @@ def _compute_coefficients(memory, h, k):
 
 @merged
 def _predict_state(memory, h, k, old, new, state, q1, v1, n):
-    """Predict (q1, v1) after a step of size h at order k from differences `old`; store predicted ones in `new`."""
+    """Predict (q1, v1) after a step of size h at order k from differences `old`; store predicted differences in `new`."""
     beta, g, G = _row(memory, BETA), _row(memory, G_VELOCITY), _row(memory, G_POSITION)
     mean_v, mean_q = _scratch_rows(memory, n)
     for m in range(0, old.shape[1], 4):

@@ -49,7 +49,7 @@ PROJECTION_WEIGHT = 0.5  # if a projection changes a stage by x tolerances, the 
 ROUNDING = 1e-13  # relative tolerance of the iteration in steps of fixed size, and of comparisons of times
 MIN_PIVOT_RATIO = 0.5  # a step fails if the pivot at its end is below this * pivot at its beginning; see FAR_END
 END_MARGIN = 2.0  # a step fails if the pivot at its end is below this * smallest pivot allowed at nodes; see FAR_END
-FAR_END = 0.3  # no step fails if the smallest pivot of C_q at its end is at least this * largest pivot of the run
+FAR_END = 0.3  # MIN_PIVOT_RATIO and END_MARGIN do not matter if the pivot at the end is at least this * largest pivot
 LATE = S - 4  # node near the end: if the pivot is larger there than at the end, the end is before the singular position
 # an attempt that computes a polynomial returns this as error and as step-size factor. So the step is repeated; it then
 # follows the polynomial
