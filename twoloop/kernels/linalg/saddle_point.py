@@ -297,7 +297,7 @@ def _run_augmented_program(w):
 
 @compiled
 def factor_augmented(f, w):
-    """Factor the augmented matrix [M G^T; G 0]; if its factors are not sparse, use f.dense_form; return a code."""
+    """Factor the augmented matrix [M G^T; G 0]; if factors are not sparse, f.form becomes dense; return a code."""
     w.n_factorizations += 1
     has_new_entry = f.constant_mass == 0 and update_pattern(w.M, w.mass_pattern)
     if w.index_a[at.SIZE] == 0 or has_new_entry or not _run_augmented_program(w):

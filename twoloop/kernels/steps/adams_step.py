@@ -168,7 +168,7 @@ def _compute_coefficients(memory, h, k):
 
 @merged
 def _predict_state(memory, h, k, old, new, state, q1, v1, n):
-    """Predict (q1, v1) after a step of size h at order k from differences `old`; store predicted differences in `new`."""
+    """Predict (q1, v1) after a step of size h at order k from differences `old`; store those at its end in `new`."""
     beta, g, G = _row(memory, BETA), _row(memory, G_VELOCITY), _row(memory, G_POSITION)
     mean_v, mean_q = _scratch_rows(memory, n)
     for m in range(0, old.shape[1], 4):
