@@ -42,8 +42,7 @@ def digest_of(text: str, *sources: str | types.ModuleType) -> str:
     return digest.hexdigest()
 
 
-# by compiled callback: the text that `Digest` hashes in place of the callback's code, see `register_digest`
-_DIGEST_TEXTS: WeakKeyDictionary[Dispatcher, str] = WeakKeyDictionary()
+_DIGEST_TEXTS: WeakKeyDictionary[Dispatcher, str] = WeakKeyDictionary()  # by callback: text hashed in its place
 
 
 def register_digest(callback: Dispatcher, text: str) -> None:
@@ -57,7 +56,7 @@ def closure_values(function: Any) -> list[Any]:
 
 
 class NotDigestible(Exception):
-    """Error: a value has no digest, because it may change in a way that no digest would show; callers do not cache."""
+    """Error: a value may change in a way that no digest shows, so that code that uses it must not be cached."""
 
 
 class Digest:
@@ -160,10 +159,7 @@ def globals_of(function: Any) -> dict[str, Any]:
 
 
 def reachable_names(function: Any, seen: set[int] | None = None) -> set[str]:
-    """Return the names of the globals and attributes that a function and its helpers use.
-
-    `seen`: ids of the functions searched before, which are skipped.
-    """
+    """Return names of globals and attributes that a function and its helpers use; skip functions with ids in `seen`."""
     seen = set() if seen is None else seen
     seen.add(id(function))
     names = names_of_code(function.__code__)
@@ -235,7 +231,7 @@ def _array_bytes(value: Any) -> bytes | None:
 def frozen_locations(function: Any, seen: set[int] | None = None) -> Iterator[FrozenValue]:
     """Yield the values that a function and its helpers use and that become part of machine code, such as arrays.
 
-    Omit values in twoloop's functions, which never change, but search their helpers. `seen`: ids searched before.
+    Omit values in twoloop's functions, which never change, but search their helpers. `seen`: ids of searched objects.
     """
     seen = set() if seen is None else seen
     if id(function) in seen:
@@ -274,7 +270,7 @@ def _is_frozen(value: Any) -> bool:
 
 
 def _value_and_items(location: FrozenValue, seen: set[int]) -> Iterator[FrozenValue]:
-    """Yield a value and, if it is a tuple, its items that are arrays, functions or tuples; `seen`: see above."""
+    """Yield a value and, if it is a tuple, its items that are arrays, functions or tuples; skip ids in `seen`."""
     yield location
     if not isinstance(location.value, tuple) or id(location.value) in seen:
         return
@@ -349,10 +345,7 @@ class FunctionCopier:
         self.copies: dict[Any, Any] = {}  # replacements, by id of the original
 
     def replacement_of(self, value: Any, names: frozenset[str] = frozenset()) -> Any:
-        """Return the replacement of a value: of a helper, of a tuple with helpers, or of a user's module.
-
-        In a copied module, only attributes with these `names` are replaced. Other values are returned unchanged.
-        """
+        """Return the replacement of a helper, a tuple, or a user's module (of its attributes `names`); else `value`."""
         if self.is_copied(value):
             if id(value) not in self.copies:
                 self._add_copy(value)
@@ -378,7 +371,7 @@ class FunctionCopier:
         return self.copies[key]  # type: ignore[no-any-return]
 
     def copy_of(self, function: Any) -> Any:
-        """Return what `wrap` returns for a copy of a Python function."""
+        """Copy a Python function, with replaced helpers, and return `wrap(copy, function)`."""
         self._add_copy(function)
         return self.copies[id(function)]
 

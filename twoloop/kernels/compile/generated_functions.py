@@ -22,8 +22,7 @@ HAS_SINGLE_PASSES = hasattr(binding.ModulePassManager, "add_reassociate_pass")
 class GeneratedFunctions:
     """Machine code of generated functions, in memory as long as this object exists.
 
-    names : names of the functions.
-    content : their object code, as `object_code` returns it.
+    content : object code of the functions with these `names`, as `object_code` returns it.
     addresses : address of each function in memory, by its name.
     """
 
@@ -52,8 +51,7 @@ class DeferredFunctions:
         return self.functions.addresses
 
 
-# GeneratedFunctions in memory: by `kind`, then by `key`, both as in `generated_functions`
-_FUNCTIONS_IN_MEMORY: dict[str, BoundedCache] = defaultdict(BoundedCache)
+_FUNCTIONS_IN_MEMORY: dict[str, BoundedCache] = defaultdict(BoundedCache)  # GeneratedFunctions by kind, then by key
 
 
 def generated_functions(

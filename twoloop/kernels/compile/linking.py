@@ -102,10 +102,7 @@ _numba_basic_indexing: Any = arrayobj.basic_indexing
 def _emit_element_address(
     context: Any, builder: Any, kind: Any, array: Any, index_types: Any, indices: Any, **options: Any
 ) -> Any:
-    """Emit code for the address of one element of a contiguous array, which is shorter than numba's general code.
-
-    For slices, other arrays or checks of bounds, call numba's own function, which emits the general code.
-    """
+    """Emit code for the address of an element of a contiguous array; in other cases, call numba's own function."""
     is_element = len(indices) == kind.ndim and all(isinstance(each, types.Integer) for each in index_types)
     if kind.layout != "C" or not is_element or options.get("boundscheck"):
         return _numba_basic_indexing(context, builder, kind, array, index_types, indices, **options)
@@ -129,10 +126,7 @@ def _options_text(options: Any) -> str:
 
 
 def _cached_call_type(self: Any, context: Any, args: Any, kws: Any) -> Any:
-    """Return numba's signature of a call (of the function or operator `self`, with arguments of these types).
-
-    It is read from a cache: numba would try all implementations for each call, a tenth of the time of compilation.
-    """
+    """Return numba's signature of a call from a cache: a tenth of the time of compilation would be spent on it."""
     key = self, args, tuple(kws.items()), _options_text(ConfigStack.top_or_none())
     if key not in _call_signatures:
         signature = _numba_call_type(self, context, args, kws)
@@ -246,7 +240,7 @@ def kernel_rules() -> Iterator[None]:
 
 
 class _CodegenWithoutEnvironment:
-    """Numba's code generator for helpers: it stores no environments, the Python data of functions that are loaded."""
+    """Numba's code generator for helpers, which are not loaded, and need no environment (Python data of a function)."""
 
     def __init__(self, codegen: Any):
         self._codegen = codegen
@@ -255,7 +249,7 @@ class _CodegenWithoutEnvironment:
         return getattr(self._codegen, name)
 
     def set_env(self, name: str, environment: Any) -> None:
-        """Do nothing: a helper is never loaded, and has no environment."""
+        """Do nothing: a helper has no environment."""
 
 
 class _HelperLibrary(CPUCodeLibrary):

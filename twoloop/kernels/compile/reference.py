@@ -53,7 +53,7 @@ class Reference(types.Type):
         self.elements = {element: (array, i) for array, named in elements.items() for element, i in named.items()}
         self.functions: dict[str, Signature] = {}
         self.llvm_functions: set[str] = set()  # fields in `functions` whose functions are generated as LLVM code
-        self.offsets: dict[str, int] = {}  # by field: index in the table of its address (of an array: and shape)
+        self.offsets: dict[str, int] = {}  # by field: index of its address in the table; the sizes of an array follow
         self.n_words = 0  # length of the table so far
         self._addresses: Any = BoundedCache()  # addresses of machine code, by the tuple of all functions of a structure
         for field, kind in self.arrays.items():
@@ -80,10 +80,7 @@ class Reference(types.Type):
         _define_call(self, field, signature)
 
     def add_llvm_functions(self, signatures: Mapping[str, Signature]) -> None:
-        """Add fields for generated functions, given their signatures by field.
-
-        A structure may lack such a function; its address is then 0. Compiled code must check this before a call.
-        """
+        """Add fields for generated functions; callers must check that the address is not 0, as one may be missing."""
         for field, signature in signatures.items():
             self.functions[field] = signature
             self.llvm_functions.add(field)
@@ -117,7 +114,6 @@ class Reference(types.Type):
         return np.array(words, dtype=np.int64)
 
     def _address(self, field: str, function: Any) -> int:
-        """Return the address of the machine code of a function, or 0 if the function is missing."""
         if field in self.llvm_functions:
             return int(function)
         return 0 if function is None else machine_code_address(function, self.functions[field])
@@ -128,10 +124,9 @@ register_model(Reference)(models.OpaqueModel)
 
 @unbox(Reference)
 def _unbox(typ: Any, obj: Any, c: Any) -> NativeValue:
-    """Emit code that converts the Python object that stands for a structure, an argument, to a pointer to its table.
+    """Emit code that converts an argument, the Python object of a structure, to a pointer to its table.
 
-    The object is the address of the table, or has this address as attribute `address`. Passing the address itself saves
-    a tenth of a microsecond.
+    The object is the address of the table (faster by a tenth of a microsecond), or has it as attribute `address`.
     """
     python_type = c.builder.load(
         c.builder.gep(c.builder.bitcast(obj, obj.type.as_pointer()), [ir.Constant(ir.IntType(32), 1)])
@@ -225,7 +220,7 @@ def _load_array(context: Any, builder: Any, typ: Any, pointer: Any, field: str) 
 
 
 def _define_call(typ: Reference, field: str, signature: Signature) -> None:
-    """Tell numba how to compile calls of a structure's function, `field`, that numba itself has compiled."""
+    """Tell numba how to compile a call of the function in a `field` of a structure, if numba compiled the function."""
     offset = typ.offsets[field]
 
     @lower_builtin((typ.name, field), typ, *signature.args)
@@ -253,7 +248,7 @@ def _llvm_type(kind: Any) -> Any:
 
 
 def _define_llvm_call(typ: Reference, field: str, signature: Signature) -> None:
-    """Tell numba how to compile calls of a structure's function, `field`, that is generated as LLVM code."""
+    """Tell numba how to compile a call of the function in a `field` of a structure, if it is a generated function."""
     offset = typ.offsets[field]
 
     @lower_builtin((typ.name, field), typ, *signature.args)

@@ -160,7 +160,7 @@ N_SAMPLES = 20  # number of time intervals between the 21 samples of one set
 MIN_TIME_AHEAD = 12.0  # samples along the motion extend at least over this number times control[SPACING], in s
 SUDDEN_RATIO = 0.1  # a change is sudden if the second difference exceeds this fraction of the range of the samples
 # a force, C_t or b counts as constant if its samples differ by at most LEAST_RANGE * rtol times the largest value so
-# far, or by at most LEAST_VALUE, because squares of smaller numbers underflow
+# far, or by at most LEAST_VALUE, as squares of smaller numbers underflow
 LEAST_RANGE, LEAST_VALUE = 0.1, 1e-150
 MIN_SAMPLES_IN_STEP = 8.0  # least number of samples in a step: all stages may miss a force that lasts a quarter of it
 RESAMPLE_BELOW = 0.25  # sample again if the time between samples must be below this fraction of its last value
@@ -278,9 +278,8 @@ def _locate_change(f, w, low, high, k, j, q, v, a):
 def _record_changes(f, w, tolerances, clock, t, begin, spacing, n, index, column, limit, q, v, a):
     """Record sudden changes just before and after sample `index`, where a force, C_t or b has a sudden bend.
 
-    Store the time of the last change in clock[LAST_CHANGE], and the shortest time between two changes in
-    clock[SHORTEST_CHANGE]. Samples k = 0 to n, at begin + k * spacing, are in this `column` of w.changes. Differences
-    of samples up to `limit` are not sudden.
+    Store the time of the last in clock[LAST_CHANGE], and the shortest time between two, in clock[SHORTEST_CHANGE].
+    Samples k = 0 to n, at begin + k * spacing, are in this `column` of w.changes. Changes up to `limit` are not sudden.
     """
     values, margin = w.changes[:, column], max(CHANGE_MARGIN * spacing, EQUAL_CHANGES * clock[at.WIDEST_SAMPLING])
     first_recorded_time = clock[at.T_START] + MIN_RECORDED_TIME * tolerances[GAP]
@@ -339,8 +338,7 @@ def first_discontinuity(f, w, tolerances, clock, t, begin, spacing, last, follow
 def _record_short_change(f, w, tolerances, control, clock, t, size, last, q, v, a):
     """Search a short step for pulses: values of a force, C_t or b far outside those before and after the step.
 
-    If the duration of a pulse (s) is the shortest so far, store it in clock[SHORTEST_CHANGE]. No sample is after the
-    time `last`.
+    Store the shortest duration (s) of a pulse so far in clock[SHORTEST_CHANGE]. No sample is after the time `last`.
     """
     changes, spacing, begin, end = w.changes, control[at.TIME_SPACING], clock[at.T_START], t + size
     clock[at.COMPARED] = t

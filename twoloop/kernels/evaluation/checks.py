@@ -130,7 +130,7 @@ def linear_ranges(coordinates_in_units, radius, negligible, scratch, ranges):
 # CONSISTENT: the state satisfies the constraints up to rounding. Only for a varying M, with L = roundings[2] max|M_ij|:
 # DEFINITE if all eigenvalues of M exceed L * EIGENVALUE_MARGIN; INDEFINITE if one is below L / EIGENVALUE_MARGIN
 WELL_FORMED, CONSISTENT, DEFINITE, INDEFINITE = 1, 2, 4, 8
-MAX_RELATIVE_DISTANCE = 0.5  # sizes recorded at a position hold at q if |q_j - recorded q_j| is at most this part
+MAX_RELATIVE_DISTANCE = 0.5  # recorded sizes of coordinates hold at q if |q_j - recorded q_j| / size_j is at most this
 ROUNDING_OF_ZERO = 2.0**-52  # a coordinate up to this fraction of the largest one may be zero with a rounding error
 EIGENVALUE_MARGIN = 2.0  # if the least eigenvalue of M is within this factor of its limit, a check in Python decides
 

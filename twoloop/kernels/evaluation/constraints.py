@@ -36,7 +36,7 @@ def clear_rows(f, w):
 
 @merged
 def row_residual(w, v, rows):
-    """Store in w.z the violations G v + (C_t, b), in these `rows`, by velocities v; w contains G, C_t and b."""
+    """Store in w.z the residuals G v + (C_t, b) of these `rows`, with the Jacobian G and the rates (C_t, b) in w."""
     for k in range(rows.size):
         row = rows[k]
         total = w.Rate[row]
@@ -73,7 +73,7 @@ def kinematics(f, w, t, q, v):
 
 @merged
 def gather_independent_columns(G, rate, rows, independent, D):
-    """Store right-hand sides for the null space, D: -G[rows, independent[j]] in row j; -rate[rows] in the last."""
+    """Prepare `find_null_space`: store -G[rows, independent[j]] in row j of D, and -rate[rows] in its last row."""
     for j in range(independent.size):
         column = independent[j]
         for k in range(rows.size):

@@ -125,7 +125,7 @@ def compute_accelerations(f, w, t, q, v, a):
 
 @compiled
 def _record_gamma_scale(w, a):
-    """Raise w.gamma_scale, the size of Gamma, to the largest sum over j of |G_ij a_j|, unless larger (G: Jacobian)."""
+    """Raise w.gamma_scale, the size of Gamma, to at least the largest sum over j of |G_ij a_j| (G: Jacobian)."""
     for i in range(w.Rate.size):
         total = 0.0
         for p in range(w.row_entries[i], w.row_entries[i + 1]):
@@ -199,7 +199,6 @@ def project_state(f, w, t, q, v, theta, a, lam):
     """Project (q, v) onto the constraints; store accelerations `a` and multipliers lam; return DONE or a failure code.
 
     q and v change in place. Corrections x of q satisfy A x = 0, where A are the rows of non-holonomic constraints.
-
     Iterations end after one that corrects q by at most theta, and v by at most theta max(1, max|v|). They also end
     after one that corrects q by at most theta times w.pivot, the smallest pivot of C_q. Then v is accurate, too: per
     unit of displacement, the directions that constraints allow turn by about 1 / w.pivot at most.
@@ -308,8 +307,7 @@ def inner_loop(f, w, task, t, q, v, tolerance, a, lam):
 def evaluate(f, w, t, q, v, tolerance, a):
     """Compute dependent from independent entries of q and v, and the accelerations `a`; return DONE or a failure code.
 
-    Newton's method for q ends after a correction of at most `tolerance`. The Jacobian may be that before the last
-    correction if this was at most w.reuse.
+    Newton's method for q ends after a correction of at most `tolerance`. Up to w.reuse, it keeps the old Jacobian.
     """
     return f.inner(f, w, tasks.EVALUATE, t, q, v, tolerance, a, w.lam)
 
@@ -340,13 +338,13 @@ def project(f, w, t, q, v, theta, a, lam):
 
 @merged
 def restore_constraints(f, w, t, q, v, tolerance):
-    """Compute dependent entries of q, up to a last correction of `tolerance`, and of v; return a code."""
+    """Compute dependent entries of q (with a last correction of at most `tolerance`) and of v; return a code."""
     return f.inner(f, w, tasks.RESTORE, t, q, v, tolerance, w.x, w.lam)
 
 
 @merged
 def accelerations(f, w, t, q, v, a, lam):
-    """Store `a` and lam at (q, v), the state that `restore_constraints` has just computed; return a code."""
+    """Store accelerations `a` and multipliers lam at (q, v), just computed by `restore_constraints`; return a code."""
     return f.inner(f, w, tasks.ACCELERATIONS, t, q, v, 0.0, a, lam)
 
 
