@@ -65,7 +65,7 @@ class Digest:
     def __init__(self) -> None:
         self.hash = hashlib.sha256(f"{DIGEST_VERSION} {np.__version__}".encode())
         self.names: set[str] = set()  # if a value is a module, only its attributes with these names are hashed
-        # serial numbers of helpers (by id and "") and of attributes of modules (by id of the module and name)
+        # serial numbers of helpers and of modules' attributes that are hashed already, by id and attribute ("": helper)
         self.positions: dict[tuple[int, str], int] = {}
         self.helpers: list[Any] = []  # compiled helpers hashed so far; a helper comes after the helpers that it calls
 

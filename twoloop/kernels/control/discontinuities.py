@@ -176,7 +176,8 @@ N_SAMPLES_IN_SHORT_STEP = 4  # number of samples within a short step, in search 
 # accelerations do not last if one of them changes by more than this fraction of the largest, when velocities change by
 # their tolerances, see `_acceleration_lasts`
 MAX_LASTING_CHANGE = 0.5
-CHANGE_MARGIN = 0.01  # a change counts as passed up to this part of the time between samples after a step's beginning
+# a step need not end at a change that is at most this fraction of the time between samples after its beginning
+CHANGE_MARGIN = 0.01
 # w.changes has a column for each force, C_t and b; its rows 0 to N_SAMPLES contain the samples of one set
 LARGEST_ROW = N_SAMPLES + 1  # row of w.changes: largest |value| of each force, C_t and b so far
 MIDDLE_ROW = N_SAMPLES + 2  # row of w.changes: one more sample, at a time between or before the samples of the set
@@ -203,7 +204,7 @@ def _least_ranges(tolerances, largest, n):
 
 @compiled
 def _is_smooth_bend(values, k, n):
-    """Return True if samples 0 to n have second differences with the same sign and a similar size at k and beside k."""
+    """Return True if samples 0 to n bend at k like a smooth curve: second differences at k and beside k are similar."""
     second_value = k + 1 if k + 2 <= n else k - 1
     if second_value < 1:
         return False

@@ -60,10 +60,10 @@ class Work(NamedTuple):
     # and the others are 0. Last row: dependent velocities due to drives (C_t and b) if all independent ones are 0
     D: Any  # (n_dof + 1, r_v) null space of the constraint Jacobian G; last row: velocities due to drives
     Gx: Any  # (n_c + n_a, n_q) constraint Jacobian at a displaced position; scratch for full pivoting
-    G_of_S: Any  # (n_c + n_a, n_q) value of G for which S and W were computed, if M is constant; NaN: they are invalid
+    G_of_S: Any  # (n_c + n_a, n_q) if M is constant: the G for which S and W were computed; NaN: S and W are invalid
     pattern: Any  # (n_c + n_a, n_q) 1 for entries of the constraint Jacobian that have been nonzero in the run, else 0
     mass_pattern: Any  # (n_q, n_q) 1 for entries of M that have been nonzero, else 0; only in the form AUGMENTED
-    row_entries: Any  # for each row of G, the index of its list in this array; then the lists: columns of its entries
+    row_entries: Any  # for each row of G, the index in this array of its list of columns with entries; then the lists
     Gamma_tried: Any  # (2, n_c + n_a) Gamma by finite differences: with twice the time step; with the one tried before
     rates: Any  # (13, n_c + n_a) constraint rates C_t and b at 13 times within a step, see discontinuities.py
     changes: Any  # (N_CHANGES, n_q + n_c + n_a) samples of forces and constraint rates, see discontinuities.py
@@ -87,7 +87,7 @@ class Work(NamedTuple):
     independent_v: Any  # (n_dof) indices of the independent velocities
     index_v: Any  # list of operations that factors G_d, the dependent columns of G (independent rows only)
     values_v: Any  # factors of G_d, the dependent columns of the constraint Jacobian G
-    index_a: Any  # list of operations that factors the augmented matrix [M G^T; G 0]; index_a[SIZE] = 0: none yet
+    index_a: Any  # list of operations that factors the augmented matrix [M G^T; G 0]; index_a[SIZE] = 0: no list yet
     values_a: Any  # factors of the augmented matrix; empty in other forms than AUGMENTED
     right: Any  # (2 (n_q + r_v)) right-hand side of equations with the augmented matrix, then scratch
     order: Any  # (n_q) scratch: order of the columns in full pivoting
@@ -188,23 +188,18 @@ KIT.add_function("attempt_many", MANY)
 # signatures of the functions generated for a mechanism, see generate/elimination.py and collocation_code.py. Those with
 # a boolean result return False, and write no results, if the code is not valid at this state, as pivots are too small
 OWN_FUNCTIONS = {
-    # functions of a state: arguments (t, q, v, f.numbers), then arrays of results. own_accelerate stores accelerations;
-    # own_correct_positions, the correction of q and the corrected q; own_project, accelerations, the correction of q,
-    # corrected q and v, and multipliers. own_redundant stores nothing: it returns True if redundant rows are satisfied
-    "own_accelerate": types.boolean(f8, VECTOR, VECTOR, VECTOR, VECTOR),
-    "own_correct_positions": types.boolean(f8, VECTOR, VECTOR, VECTOR, VECTOR, VECTOR),
-    "own_project": types.boolean(f8, *[VECTOR] * 8),
-    "own_redundant": types.boolean(f8, VECTOR, VECTOR, VECTOR, VECTOR),
-    # functions of collocation; `memory` is described in data/collocation.py, `numbers` is f.own_numbers. attempt_nodes
-    # (memory, state, tolerances, numbers) solves for the stages and returns a code such as CONVERGED; audit_nodes
-    # (memory, state, numbers) returns the defect between nodes. Those without a result: retry_nodes (memory, state),
-    # end_nodes (memory, state, new_state), correct_ends and project_ends (memory, numbers)
-    "attempt_nodes": f8(*[VECTOR] * 4),
-    "audit_nodes": f8(*[VECTOR] * 3),
-    "retry_nodes": types.none(*[VECTOR] * 2),
-    "end_nodes": types.none(*[VECTOR] * 3),
-    "correct_ends": types.none(*[VECTOR] * 2),
-    "project_ends": types.none(*[VECTOR] * 2),
+    # functions of a state: arguments (t, q, v, f.numbers), then the arrays of results that the comments name
+    "own_accelerate": types.boolean(f8, VECTOR, VECTOR, VECTOR, VECTOR),  # accelerations
+    "own_correct_positions": types.boolean(f8, VECTOR, VECTOR, VECTOR, VECTOR, VECTOR),  # correction of q, corrected q
+    "own_project": types.boolean(f8, *[VECTOR] * 8),  # accelerations, correction of q, corrected q and v, multipliers
+    "own_redundant": types.boolean(f8, VECTOR, VECTOR, VECTOR, VECTOR),  # none; True: redundant rows are satisfied
+    # functions of collocation steps; `memory` is described in data/collocation.py, `numbers` is f.own_numbers
+    "attempt_nodes": f8(*[VECTOR] * 4),  # (memory, state, tolerances, numbers): solve for stages; code: CONVERGED, ...
+    "audit_nodes": f8(*[VECTOR] * 3),  # (memory, state, numbers): return the largest defect between nodes; -1: failure
+    "retry_nodes": types.none(*[VECTOR] * 2),  # (memory, state): predict a shorter step from a rejected one
+    "end_nodes": types.none(*[VECTOR] * 3),  # (memory, state, new_state): compute the state at the end of the step
+    "correct_ends": types.none(*[VECTOR] * 2),  # (memory, numbers): move the ends of eight steps towards C = 0
+    "project_ends": types.none(*[VECTOR] * 2),  # (memory, numbers): project these ends; compute a and multipliers
 }
 KIT.add_llvm_functions(OWN_FUNCTIONS)
 
@@ -313,7 +308,7 @@ class Kit:
     `functions`: callbacks and data of the system. `inner`: the inner loop, which may call functions generated for the
     mechanism (`own`; (): none). `general`: the inner loop for any mechanism, which does what these cannot do. `step`:
     functions of the method; None: no kernel calls them. `first`, `second`: those of two methods between which the run
-    may switch. `numbers`, `own_numbers`: data for generated functions of a state, and for those of collocation.
+    may switch. `numbers`, `own_numbers`: data that generated functions of a state, and of collocation steps, read.
     """
 
     def __init__(
@@ -379,7 +374,7 @@ def finite(A):
 
 @compiled
 def not_finite(w, kind, t, q):
-    """Record in w that a callback (of index `kind`) or, as index -1, q is not finite at t; return NOT_FINITE."""
+    """Record which callback (index `kind`; -1: q is not finite) returned NaN or infinity, when; return NOT_FINITE."""
     w.fault_kind = kind if finite_vector(q) else -1.0
     w.fault_time = t
     return NOT_FINITE
