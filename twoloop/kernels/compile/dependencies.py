@@ -35,7 +35,7 @@ DIGEST_VERSION = 2  # part of all digests: increase it to make all machine code 
 
 
 def digest_of(text: str, *sources: str | types.ModuleType) -> str:
-    """Return one hash of a text and of the contents of source files, each given by its path or its module."""
+    """Return one hash of a text and of source files (paths or modules), which shows that cached files are outdated."""
     digest = hashlib.sha256(text.encode())
     for source in sources:
         digest.update(Path(source if isinstance(source, str) else str(source.__file__)).read_bytes())

@@ -151,6 +151,6 @@ def _new_target_machine() -> Any:
 
 
 def has_wide_vectors() -> bool:
-    """Return True if the processor for which numba compiles has vectors of eight doubles (AVX-512)."""
+    """Return True if the processor for which numba compiles has registers of eight doubles (AVX-512)."""
     _, _, features = cpu_target.target_context.codegen().magic_tuple()
     return "+avx512f" in features.split(",")

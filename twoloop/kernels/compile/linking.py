@@ -64,7 +64,7 @@ def jitable_templates(function: Any) -> list[Any]:
 def add_signature(function: Dispatcher, signature: Any) -> None:
     """Let numba call a compiled function also with the argument types of `signature`, without compiling it again.
 
-    The new types must have the same layout in memory as the types for which the function was compiled.
+    The types must have the same layout in memory, such as writable arrays in place of read-only ones in a callback.
     """
     dispatcher: Any = function
     (compiled,) = dispatcher.overloads.values()
@@ -81,7 +81,7 @@ def options_of(helper: Any) -> dict[str, Any]:
 
 
 def discard_compiled_code(function: Any) -> None:
-    """Discard numba's compiled code of a function decorated by `register_jitable`; its next use compiles it again."""
+    """Discard numba's code of a function decorated by `register_jitable`, for example because its globals changed."""
     for template in jitable_templates(function):
         template._impl_cache.clear()
 

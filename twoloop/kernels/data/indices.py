@@ -45,7 +45,7 @@ FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN, REACTION_BY_Q_GIVEN, MASS_VALUES_GIVEN = (
 # indices in Work.counters: numbers of steps, iterations, evaluations etc. since the start of the run
 (
     N_ACCEPTED,  # number of accepted steps
-    N_REJECTED_ERROR,  # number of steps rejected because of their error
+    N_REJECTED_ERROR,  # number of steps rejected for their error, or repeated at a jump or near a singular position
     N_REJECTED_CONVERGENCE,  # number of steps that failed, for example because an iteration did not converge
     N_OUTER,  # number of iterations of the outer loop, each of which evaluates all stages of a step
     N_INNER,  # number of iterations of the inner loop, which moves positions onto the constraints

@@ -323,7 +323,7 @@ def evaluate_state(f, w, t, q, v, tolerance, a, lam):
 
 @merged
 def evaluate_without_projection(f, w, t, q, v, a):
-    """Store the accelerations at (q, v), which may violate the constraints, in `a`; return DONE or a failure code."""
+    """Store accelerations in `a` at a stage (q, v), which may violate the constraints; return a code."""
     return f.inner(f, w, tasks.EVALUATE_WITHOUT_PROJECTION, t, q, v, 0.0, a, w.lam)
 
 
@@ -356,13 +356,13 @@ def multipliers(f, w, t, q, v, a, lam):
 
 @merged
 def find_tangents(f, w, t, q):
-    """Store the constraint Jacobian at q, its factors and its null space in w; return DONE or a failure code."""
+    """Store the constraint Jacobian at q, its factors and its null space (tangents) in w; return a code."""
     return f.inner(f, w, tasks.FIND_NULL_SPACE, t, q, q, 0.0, w.x, w.lam)
 
 
 @merged
 def prepare_mass(f, w, t, q):
-    """Store the mass matrix in w and, if the form f.form uses them, its factors; return DONE or a failure code."""
+    """At the start of a run, store the mass matrix in w and, if f.form needs them, its factors; return a code."""
     return f.inner(f, w, tasks.PREPARE_MASS, t, q, q, 0.0, w.x, w.lam)
 
 
