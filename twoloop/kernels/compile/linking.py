@@ -44,10 +44,7 @@ __all__ = ["Dispatcher", "add_signature", "cgutils", "discard_compiled_code", "j
 
 
 def jitable_templates(function: Any) -> list[Any]:
-    """Return the templates by which numba compiles a function decorated by `register_jitable`; [] for other functions.
-
-    Numba compiles such a function again for each function that calls it.
-    """
+    """Return the templates by which numba compiles a `register_jitable` function anew for each caller, else []."""
     context: Any = cpu_target.typing_context
     if not isinstance(function, FunctionType):
         return []
@@ -184,10 +181,7 @@ _numba_load_registries: Any = CPUContext.load_additional_registries
 
 
 def _load_registries_once(self: Any) -> None:
-    """Install numba's implementations of Python and NumPy functions in `self`, a copy of a compilation context.
-
-    Copies share the lists (registries) of implementations. Import these for the first copy only; numba would for each.
-    """
+    """Install numba's implementations of Python and NumPy functions in a context; import them only for the first."""
     if self._registries:
         for registry in list(self._registries):
             self.install_registry(registry)

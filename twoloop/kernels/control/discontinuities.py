@@ -75,18 +75,18 @@ def _slope_and_size(w, row, length):
 
 
 @compiled
-def _allowed_error(f, w, tolerances, x, row):
-    """Return how far entry `row` of G x (G: Jacobian) changes at most if one velocity in x changes by its tolerance."""
+def _allowed_error(f, w, tolerances, v, row):
+    """Return how much entry `row` of G v (G: Jacobian) changes at most if one velocity changes by its tolerance."""
     largest = 0.0
     if f.form == FIXED_ORDER:
         rows, columns, _ = jacobian_entries_of(f.ldl_program)
         for k in range(rows.size):
             if rows[k] == row:
-                tolerance = tolerances[ATOL + columns[k]] + tolerances[RTOL] * abs(x[columns[k]])
+                tolerance = tolerances[ATOL + columns[k]] + tolerances[RTOL] * abs(v[columns[k]])
                 largest = max(largest, abs(w.jacobian_values[k]) * tolerance)
         return largest
-    for m in range(x.size):
-        tolerance = tolerances[ATOL + m] + tolerances[RTOL] * abs(x[m])
+    for m in range(v.size):
+        tolerance = tolerances[ATOL + m] + tolerances[RTOL] * abs(v[m])
         largest = max(largest, abs(w.G[row, m]) * tolerance)
     return largest
 

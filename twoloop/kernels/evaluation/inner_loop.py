@@ -314,10 +314,7 @@ def evaluate(f, w, t, q, v, tolerance, a):
 
 @merged
 def evaluate_state(f, w, t, q, v, tolerance, a, lam):
-    """Compute dependent entries of q and v, accelerations `a` and multipliers lam; return DONE or a failure code.
-
-    Dependent entries are accurate up to rounding, as needed at ends of steps. For stages, `evaluate` is faster.
-    """
+    """Compute dependent entries of q and v up to rounding, as at ends of steps, and `a` and lam; return a code."""
     return f.inner(f, w, tasks.EVALUATE_STATE, t, q, v, tolerance, a, lam)
 
 
