@@ -5,6 +5,8 @@ import pytest
 
 from tests.general.mechanisms import REDUNDANT, REGULAR, mechanism, relative_error, run
 from tests.mechanisms.make_references import solution
+from tests.problems import pendulum, worst
+from twoloop import solve_dae
 
 METHODS = ("DOP853", "Gauss12", "Adams")
 DIGITS = {"Adams": 1e-8}  # its errors are up to a hundred times the tolerance
@@ -50,3 +52,25 @@ def test_a_run_has_nine_digits_constraints_energy_multipliers_and_rank(name, met
     assert len(warned) == (name in REDUNDANT) and all(str(row) in warned[0] for row in result.redundant)
     if name == "wobbling disc, redundant":  # the derivative of a row of positions does not replace that row
         assert list(result.redundant) == [3]
+
+
+def swing(size, time, method, rtol):
+    """Return q and v, in these units, of a damped pendulum of length `size` (m) that swings within `time` (s)."""
+    weight = np.array([0.0, -9.81 * size / time**2])
+    system = pendulum(
+        gamma=False,
+        force=lambda t, q, v: weight - 0.3 / time * v,
+        constraint=lambda t, q: np.array([0.5 * (q[0] * q[0] + q[1] * q[1] - size * size)]),
+    )
+    times, start = np.linspace(0.0, 3.0 * time, 31), np.array([0.8 * size, -0.6 * size])
+    atol = rtol * min(size, size / time)
+    result = solve_dae(system, (0.0, times[-1]), start, np.zeros(2), method, rtol, atol, t_eval=times)
+    assert result.success, result.message
+    return np.concatenate([result.q / size, result.v / (size / time)])
+
+
+@pytest.mark.parametrize("method", ["Lobatto16", "Gauss12", "RadauIIA5", "RadauIIA9", "TRBDF2", "ESDIRK4"])
+@pytest.mark.parametrize(("size", "time"), [(1e-9, 1e3), (1e-6, 1e4), (1e4, 1e-2)])
+def test_errors_in_tolerances_do_not_depend_on_units(method, size, time):
+    rtol = 1e-11 if method in ("Lobatto16", "Gauss12", "RadauIIA9") else 1e-6
+    assert worst(swing(size, time, method, rtol), swing(1.0, 1.0, "DOP853", 1e-12)) < 60.0 * rtol

@@ -346,9 +346,8 @@ class Interpolator:
         Return a dict: the key is the time at which an interval begins, the value is its (times, states).
         """
         n = self.system.n_q
-        tolerances = np.zeros(ATOL + n)  # tolerances[ESTIMATE] = 0: steps do not estimate errors
         state = np.zeros(3 * n + self.system.n_c + self.system.n_a)
-        step_arrays = (plan.options, plan.memory.copy(), plan.memory, tolerances, state, state.copy())
+        step_arrays = (plan.options, plan.memory.copy(), plan.memory, self.tolerances, state, state.copy())
         interior_states = {}
         for parts in range(plan.parts, 1, -1):
             if len(numbers) == 0:

@@ -406,6 +406,44 @@ def allowed_error(tolerances, m, x, x1):
     return tolerances[ATOL + m] + tolerances[RTOL] * max(abs(x), abs(x1))
 
 
+TINY = 1e-300  # smallest result of `smallest_size`, which avoids divisions by zero if an absolute tolerance is zero
+
+
+@merged
+def smallest_size(tolerances):
+    """Return the size that smaller coordinates and velocities count as: the smallest atol / rtol, at most 1."""
+    size = 1.0
+    if tolerances[RTOL] > 0.0:
+        for k in range(ATOL, tolerances.size):
+            size = min(size, tolerances[k] / tolerances[RTOL])
+    return max(size, TINY)
+
+
+@merged
+def typical_size(tolerances, x):
+    """Return the size that smaller components of x (q or v) count as in comparisons: 1, or less if all of x is small.
+
+    For a mechanism of 1e-9 m, a displacement by 1e-7 m would be too long, and a correction of 1e-14 m too large. But x
+    may be rounding errors, as velocities at rest are; so the size is not below `smallest_size`, at which the absolute
+    tolerance begins to count.
+    """
+    size = smallest_size(tolerances)
+    for k in range(x.size):
+        size = min(max(size, abs(x[k])), 1.0)
+    return size if size > TINY else 1.0
+
+
+@merged
+def max_change_by_rounding(limit, change, change_q, change_v, size_q, size_v):
+    """Return the largest relative change in an iteration that may be due to rounding.
+
+    `change` is the larger one of change_q / size_q and change_v / size_v. Rounding can keep the iteration from going on
+    if changes relative to at least 1 are at most `limit`.
+    """
+    rounded = max(change_q / max(size_q, 1.0), change_v / max(size_v, 1.0))
+    return limit * (change / rounded) if rounded > 0.0 else limit
+
+
 @merged
 def is_beyond_gap(tolerances, h):
     """Return True if a step of size h is longer than tolerances[GAP], the longest allowed time between evaluations."""

@@ -60,10 +60,11 @@ LANES = 8 if has_wide_vectors() else 4  # number of runs at once: the number of 
     JUMP_END,  # time (s) at the end of the last step that was rejected with an error above SUDDEN_ERROR
     SHIFT,  # number from 0 to 1 that shifts the times of evaluations of the defect within a step
     EVALUATED,  # number of evaluations within the step, in addition to settings[N_EVALUATIONS]
+    DISPLACED,  # smallest size for displacements in finite differences, see `typical_size`
     PAST,  # size and error of the last accepted step, for step-size control: both of lane 0, then both of lane 1, ...
     _MORE_PAST,
     N_FIELDS,
-) = range(31)
+) = range(32)
 # names of functions that are generated for each mechanism; methods of the same names, such as `commit` in
 # generate/lane_code.py, write them. Arguments: order of the Taylor series, settings `control`, memory `work`
 TASKS = ("correct_positions", "correct_state", "check_redundant_rows", "compute_prediction_error", "commit")

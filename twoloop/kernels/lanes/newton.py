@@ -11,7 +11,7 @@ are computed anew, by finite differences. Offsets and names in capitals belong t
 
 import numpy as np
 
-from twoloop.kernels.data.common import compiled, kernel, merged
+from twoloop.kernels.data.common import TINY, compiled, kernel, max_change_by_rounding, merged
 from twoloop.kernels.lanes import layout as at
 from twoloop.kernels.lanes.control import LEAST, N_HEAD, begin_control, choose_steps, end_steps, judge_steps, set_end
 from twoloop.kernels.lanes.layout import (
@@ -28,7 +28,7 @@ from twoloop.kernels.lanes.layout import (
     vector_range,
 )
 from twoloop.kernels.linalg.dense import sum_rows
-from twoloop.kernels.steps.newton_systems import MAX_ITERATIONS, MAX_ROUNDING_CORRECTION, RELATIVE_DISPLACEMENT
+from twoloop.kernels.steps.newton_systems import MAX_ITERATIONS, MAX_ROUNDING_CORRECTION, displace
 from twoloop.kernels.steps.stages import (
     GAMMA0,
     MAX_STEP_RATIO,
@@ -48,8 +48,8 @@ from twoloop.kernels.steps.velocity_errors import LONGEST_GAPS, SLOW_FACTOR, STE
     ITERATING,  # 1 in lanes where Newton's iteration has not ended
     DONE,  # 1 in lanes where Newton's iteration has converged (not the status code of this name)
     CHANGE_BEFORE,  # largest correction by the previous iteration, relative to SCALE_Q and SCALE_V
-    SCALE_Q,  # largest absolute position at the stages, at least 1
-    SCALE_V,  # largest absolute velocity at the stages, at least 1
+    SCALE_Q,  # largest absolute position at the stages, at least `smallest_size`
+    SCALE_V,  # largest absolute velocity at the stages, at least `smallest_size`
     LARGEST_Q,  # largest correction of a stage's position by this iteration, divided by the square of the step size
     LARGEST_V,  # largest correction of a stage's velocity by this iteration, divided by the step size
     H_PREVIOUS,  # size (s) of the step whose accelerations are in PREVIOUS; 0: there is no such step
@@ -142,6 +142,27 @@ def _evaluate_middle_state(code, settings, control, c, work, new, a, memory):
     copy_vectors(work, a, vector_offset(memory, n, MIDDLE_A), n)
 
 
+@merged
+def _smallest_size(control, n):
+    """Return `smallest_size` of the tolerances in `control`."""
+    size = 1.0
+    if control[at.RTOL] > 0.0:
+        for j in range(n):
+            size = min(size, control[at.ATOL + j] / control[at.RTOL])
+    return max(size, TINY)
+
+
+@merged
+def _store_typical_size(control, work, n, vector):
+    """Store the smallest size for displacements of the `vector` q or v in DISPLACED, see `typical_size`."""
+    least = _smallest_size(control, n)
+    for k in range(LANES):
+        size = least
+        for j in range(n):
+            size = min(max(size, abs(work[(vector + j) * LANES + k])), 1.0)
+        work[at.DISPLACED * LANES + k] = size if size > TINY else 1.0
+
+
 @compiled
 def compute_derivatives(code, settings, control, c, work):
     """Store DERIVATIVE_Q and DERIVATIVE_V, derivatives of accelerations by q and v, in the middle of the step.
@@ -154,10 +175,12 @@ def compute_derivatives(code, settings, control, c, work):
     _evaluate_middle_state(code, settings, control, c, work, new, a, memory)
     middle, middle_a = vector_offset(memory, n, MIDDLE_Q), vector_offset(memory, n, MIDDLE_A)
     for column in range(2 * n):
+        if column % n == 0:
+            _store_typical_size(control, work, n, middle + column)
         copy_vectors(work, middle, new, 2 * n)
         for k in range(LANES):
             index = (new + column) * LANES + k
-            work[index] += RELATIVE_DISPLACEMENT * max(1.0, abs(work[index]))
+            work[index] = displace(work[index], work[at.DISPLACED * LANES + k])
         code.compute_accelerations(order, control, work)
         matrix = matrix_offset(memory, n, s, DERIVATIVE_Q if column < n else DERIVATIVE_V) + column % n
         for k in range(LANES):
@@ -239,8 +262,8 @@ def _compute_residuals(code, settings, control, A, A2, c, work):
     stages, sums = block_offset(memory, n, s, STAGES), vector_offset(memory, n, SUMS)
     begin, residual = vector_offset(memory, n, BEGIN_Q), block_offset(memory, n, s, RESIDUAL)
     stage_rows, total = matrix_view(work, stages, s, n), vector_range(work, sums, n)
-    fill_field(work, memory + SCALE_Q, 1.0)
-    fill_field(work, memory + SCALE_V, 1.0)
+    fill_field(work, memory + SCALE_Q, _smallest_size(control, n))
+    fill_field(work, memory + SCALE_V, _smallest_size(control, n))
     for j in range(s):
         sum_rows(A2[j], stage_rows, total)
         for m in range(n):
@@ -324,13 +347,14 @@ def _store_largest_corrections(settings, A, A2, work):
 def _has_iteration_ended(options, work, memory, iteration, k):
     """Set the field DONE to 1 if Newton's iteration in lane k has converged, else to 0; return True if it has ended."""
     x, tolerance = work[at.X * LANES + k], options[N_HEAD + OUTER_TOL]
-    rounding_limit = MAX_ROUNDING_CORRECTION * options[LEAST]
-    change_v = x * work[(memory + LARGEST_V) * LANES + k] / work[(memory + SCALE_V) * LANES + k]
-    change_q = x * x * work[(memory + LARGEST_Q) * LANES + k] / work[(memory + SCALE_Q) * LANES + k]
-    change, before = max(change_v, change_q), work[(memory + CHANGE_BEFORE) * LANES + k]
+    scale_q, scale_v = work[(memory + SCALE_Q) * LANES + k], work[(memory + SCALE_V) * LANES + k]
+    change_v, change_q = x * work[(memory + LARGEST_V) * LANES + k], x * x * work[(memory + LARGEST_Q) * LANES + k]
+    change, before = max(change_v / scale_v, change_q / scale_q), work[(memory + CHANGE_BEFORE) * LANES + k]
     work[(memory + CHANGE_BEFORE) * LANES + k] = change
     if not np.isfinite(change_v + change_q) or work[at.ACTIVE * LANES + k] == 0.0:
         return True
+    limit = MAX_ROUNDING_CORRECTION * options[LEAST]
+    rounding_limit = max_change_by_rounding(limit, change, change_q, change_v, scale_q, scale_v)
     n_left = MAX_ITERATIONS - 1 - iteration
     contraction = change / before if iteration > 0 and before > 0.0 else 0.0
     if iteration == 0:

@@ -9,7 +9,7 @@ the paper; `f` is the kit, `w` the workspace.
 import numpy as np
 
 from twoloop.kernels.control.step_size import project_prediction
-from twoloop.kernels.data.common import compiled, exact, inlined, merged
+from twoloop.kernels.data.common import compiled, exact, inlined, merged, typical_size
 from twoloop.kernels.data.indices import ATOL, DONE, ESTIMATE, OUTER_DIVERGED, RTOL
 from twoloop.kernels.evaluation.inner_loop import evaluate, restore_constraints, rounding_floor
 from twoloop.kernels.linalg.dense import copy
@@ -79,17 +79,18 @@ UNDECIDED, CONVERGED, DIVERGED = range(3)  # codes of `_test_convergence`
 
 
 @merged
-def _test_convergence(change, last_change, first_change, iteration, tolerance, q):
+def _test_convergence(change, last_change, first_change, rounded, iteration, tolerance, q):
     """Decide whether an iteration has converged: return UNDECIDED, CONVERGED or DIVERGED.
 
     It has if the change of the stages is at most `tolerance`, or if rounding errors of q keep it from decreasing.
+    `rounded`: change relative to max(1, |value|), with which rounding errors are compared.
     """
     if change <= tolerance:
         return CONVERGED
     if not change <= MAX_GROWTH * first_change:
         return DIVERGED
     if change >= last_change:
-        if change <= rounding_floor(q):
+        if rounded <= rounding_floor(q):
             return CONVERGED
         if iteration >= MIN_ITERATIONS:
             return DIVERGED
@@ -130,6 +131,7 @@ def iterate_accelerations(f, w, options, tolerances, t, h, q, v, A_stage, Q_stag
             for k in range(s):
                 total += A2[j, k] * A_stage[k, m]
             Q_stage[j, m] = q[m] + c[j] * h * v[m] + h * h * total
+    size_q, size_v = typical_size(tolerances, q), typical_size(tolerances, v)
     first_change = 0.0
     last_change = np.inf
     convergence = UNDECIDED
@@ -145,19 +147,20 @@ def iterate_accelerations(f, w, options, tolerances, t, h, q, v, A_stage, Q_stag
                     sum_v += A[j, k] * A_stage[k, m]
                 Q_stage[j, m] = q[m] + c[j] * h * v[m] + h * h * sum_q
                 V_stage[j, m] = v[m] + h * sum_v
-        change = 0.0
+        change, rounded = 0.0, 0.0
         for j in range(s):
             code = evaluate(f, w, t + c[j] * h, Q_stage[j], V_stage[j], tolerance, q1)
             if code != DONE:
                 return code, 0.0
             for m in w.independent:
                 difference = h * abs(q1[m] - A_stage[j, m])
-                change = max(change, difference / max(abs(V_stage[j, m]), 1.0))
-                change = max(change, h * difference / max(abs(Q_stage[j, m]), 1.0))
+                size_Q, size_V = abs(Q_stage[j, m]), abs(V_stage[j, m])
+                change = max(change, difference / max(size_V, size_v), h * difference / max(size_Q, size_q))
+                rounded = max(rounded, difference / max(size_V, 1.0), h * difference / max(size_Q, 1.0))
             copy(q1, A_stage[j])
         if iteration == 0:
             first_change = change
-        convergence = _test_convergence(change, last_change, first_change, iteration, options[OUTER_TOL], q)
+        convergence = _test_convergence(change, last_change, first_change, rounded, iteration, options[OUTER_TOL], q)
         if convergence != UNDECIDED:
             break
         last_change = change

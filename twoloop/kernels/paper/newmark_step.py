@@ -3,7 +3,7 @@
 import numpy as np
 
 from twoloop.kernels.control.step_size import commit_nothing, prediction_error
-from twoloop.kernels.data.common import ATTEMPT, Attempt, Step, compiled, kernel, merged
+from twoloop.kernels.data.common import ATTEMPT, Attempt, Step, compiled, kernel, merged, typical_size
 from twoloop.kernels.data.indices import ATOL, DONE, ESTIMATE, GAP, OUTER_DIVERGED, RTOL
 from twoloop.kernels.evaluation.inner_loop import evaluate_state, rounding_floor
 from twoloop.kernels.linalg.dense import copy
@@ -74,6 +74,7 @@ def newmark_step(f, w, options, memory, t, h, tolerances, state, new_state):
     for m in range(n):
         a1[m] = a[m]
         q1[m] = q[m] + h * v[m] + 0.5 * h * h * a[m]  # for dependent coordinates, this is a first guess
+    size_q, size_v = typical_size(tolerances, q), typical_size(tolerances, v)
     last_change = np.inf
     for _ in range(MAX_ITERATIONS):
         w.n_outer += 1
@@ -83,13 +84,14 @@ def newmark_step(f, w, options, memory, t, h, tolerances, state, new_state):
         code = evaluate_state(f, w, t + h, q1, v1, options[INNER_TOL], a_new, lam1)
         if code != DONE:
             return Attempt(code, np.inf, 0.0)
-        change = 0.0
+        change, rounded = 0.0, 0.0
         for m in w.independent:
             difference = h * abs(a_new[m] - a1[m])
-            change = max(change, gamma * difference / max(abs(v1[m]), 1.0))
-            change = max(change, beta * h * difference / max(abs(q1[m]), 1.0))
+            change_q, change_v = beta * h * difference, gamma * difference
+            change = max(change, change_v / max(abs(v1[m]), size_v), change_q / max(abs(q1[m]), size_q))
+            rounded = max(rounded, change_v / max(abs(v1[m]), 1.0), change_q / max(abs(q1[m]), 1.0))
         copy(a_new, a1)
-        if change <= options[OUTER_TOL] or (change >= last_change and change <= rounding_floor(q)):
+        if change <= options[OUTER_TOL] or (change >= last_change and rounded <= rounding_floor(q)):
             error = 0.0
             if tolerances[ESTIMATE] == 1.0:
                 rate = _motion_rate(memory, tolerances[GAP], q, v, a, q1, v1, a1)

@@ -24,7 +24,18 @@ errors of many short steps add up to about the tolerance, not to a multiple of i
 import numpy as np
 
 from twoloop.kernels.control.step_size import prediction_error, store_prediction
-from twoloop.kernels.data.common import ATTEMPT, COMMIT, Attempt, Step, allowed_error, compiled, inlined, kernel, merged
+from twoloop.kernels.data.common import (
+    ATTEMPT,
+    COMMIT,
+    Attempt,
+    Step,
+    allowed_error,
+    compiled,
+    inlined,
+    kernel,
+    merged,
+    smallest_size,
+)
 from twoloop.kernels.data.indices import DONE, ESTIMATE, FIXED_ORDER, OUTER_DIVERGED, SINGULAR
 from twoloop.kernels.evaluation.inner_loop import evaluate, evaluate_state, find_tangents, multipliers
 from twoloop.kernels.linalg.dense import copy, ldl_factor, ldl_solve, lu_factor, lu_solve
@@ -101,7 +112,7 @@ def factor_newton_matrix(w, memory, z):
 
 
 @compiled
-def compute_and_factor_matrix(f, w, memory, t, q, v, z):
+def compute_and_factor_matrix(f, w, tolerances, memory, t, q, v, z):
     """Compute the derivatives of forces at (t, q, v), and factor Newton's matrix with them; return a code.
 
     The last evaluation must have been at (t, q, v), w.lam must be the multipliers there. z: step size times gamma.
@@ -112,7 +123,7 @@ def compute_and_factor_matrix(f, w, memory, t, q, v, z):
     storage = matrix_storage(w, n, at.FILTER)
     K, R = storage.reshape((n, n)), matrix_storage(w, n, at.SYSTEMS).reshape((n, n))
     AT = matrix_storage(w, n, at.SYSTEMS + 1)[: n * m].reshape((n, m))
-    code = fill_tangent_by_q(f, w, t, q, v, n - 1, vector(memory, 1, n, at.Q_MOVED), K, R)
+    code = fill_tangent_by_q(f, w, tolerances, t, q, v, n - 1, vector(memory, 1, n, at.Q_MOVED), K, R)
     if code == DONE:
         code = find_tangents(f, w, t, q)
     if code != DONE:
@@ -210,7 +221,7 @@ def stages_at_once(options):
 
 
 @compiled
-def _update_derivatives(f, w, options, memory, t, h, Q, V, F):
+def _update_derivatives(f, w, options, tolerances, memory, t, h, Q, V, F):
     """Renew outdated derivatives, at the state (t, Q, V) with accelerations F, and Newton's factors; return a code."""
     if f.force_by_q_given == 1 or memory[at.HAS_JACOBIAN] == 0.0:
         multipliers(f, w, t, Q, V, F, w.lam)
@@ -218,8 +229,8 @@ def _update_derivatives(f, w, options, memory, t, h, Q, V, F):
         memory[at.IS_FRESH] = 1.0
         memory[at.H_FACTORED] = 0.0
         if has_dense_tangents(f, w):
-            return compute_and_factor_matrix(f, w, memory, t, Q, V, h * gamma_of(options))
-        code = fill_derivatives(f, w, options, memory, stages_at_once(options), t, Q, V, F)
+            return compute_and_factor_matrix(f, w, tolerances, memory, t, Q, V, h * gamma_of(options))
+        code = fill_derivatives(f, w, options, tolerances, memory, stages_at_once(options), t, Q, V, F)
         if code != DONE:
             return code
     if abs(memory[at.H_FACTORED] - h) > EQUAL_STEP_TOLERANCE * h:
@@ -228,7 +239,7 @@ def _update_derivatives(f, w, options, memory, t, h, Q, V, F):
 
 
 @compiled
-def solve_stage(f, w, options, memory, t, h, A_stage):
+def solve_stage(f, w, options, tolerances, memory, t, h, A_stage):
     """Solve for the accelerations A_stage (1, n_q) of a stage at the time t by Newton's method; return a code.
 
     On entry, A_stage contains predicted accelerations. Q_MID and V_MID in `memory` become the state of the stage.
@@ -240,7 +251,7 @@ def solve_stage(f, w, options, memory, t, h, A_stage):
     residual = block(memory, 1, n, at.RESIDUAL)
     a = A_stage[0]
     has_tangents = f.force_by_q_given == 1
-    last_change = 0.0
+    last_change, least_size = 0.0, smallest_size(tolerances)
     for iteration in range(MAX_ITERATIONS):
         w.n_outer += 1
         for m in range(n):
@@ -249,7 +260,7 @@ def solve_stage(f, w, options, memory, t, h, A_stage):
         code = evaluate(f, w, t, Q, V, options[at.INNER_TOL], F)
         if code != DONE:
             return code
-        scale_q, scale_v = 1.0, 1.0
+        scale_q, scale_v = least_size, least_size
         for m in range(n):
             residual[0, m] = F[m] - a[m]
         for m in w.independent:
@@ -258,7 +269,7 @@ def solve_stage(f, w, options, memory, t, h, A_stage):
         if f.form != FIXED_ORDER:  # in the fixed-order form, no coordinate is dependent
             for m in w.dependent:
                 a[m] = F[m]
-        code = _update_derivatives(f, w, options, memory, t, h, Q, V, F)
+        code = _update_derivatives(f, w, options, tolerances, memory, t, h, Q, V, F)
         if code != DONE:
             memory[at.HAS_JACOBIAN] = 0.0
             return code
@@ -341,7 +352,7 @@ def _store_weighted_sums(w, h, V_stage, A_stage, weights, factor, e_q, e_v):
 
 
 @compiled
-def _renew_derivatives(f, w, options, memory, t, h, new_state):
+def _renew_derivatives(f, w, options, tolerances, memory, t, h, new_state):
     """Compute derivatives at the end (t, `new_state`) of a step of size h; factor Newton's matrices; return a code."""
     n = w.Q.size
     Q, V, F = vector(memory, 1, n, at.Q_MID), vector(memory, 1, n, at.V_MID), vector(memory, 1, n, at.A_MID)
@@ -352,7 +363,7 @@ def _renew_derivatives(f, w, options, memory, t, h, new_state):
     if code != DONE:
         return code
     multipliers(f, w, t, Q, V, F, w.lam)
-    code = fill_derivatives(f, w, options, memory, stages_at_once(options), t, Q, V, F)
+    code = fill_derivatives(f, w, options, tolerances, memory, stages_at_once(options), t, Q, V, F)
     if code == DONE:
         code = factor_systems(f, w, options, memory, stages_at_once(options), h)
     if code == DONE:
@@ -381,7 +392,7 @@ def _estimate(f, w, options, memory, t, h, tolerances, state, new_state, V_stage
         f, w, options, memory, 1, t + h, z, tolerances, unfiltered, e_q, e_v, state, new_state, A_stage[-1]
     ):
         memory[at.DERIVATIVES_RENEWED] = 1.0
-        if _renew_derivatives(f, w, options, memory, t + h, h, new_state) != DONE:
+        if _renew_derivatives(f, w, options, tolerances, memory, t + h, h, new_state) != DONE:
             return np.inf
         _store_weighted_sums(w, h, V_stage, A_stage, weights, factor, e_q, e_v)
         copy(e_v, unfiltered)
@@ -514,11 +525,11 @@ def diagonal_step(f, w, options, memory, t, h, tolerances, state, new_state):
             q_bar[m] = q[m] + h * sum_q
             v_bar[m] = v[m] + h * sum_v
         copy(A_stage[j - 1], A_stage[j])
-        code = solve_stage(f, w, options, memory, t + c[j] * h, h, A_stage[j : j + 1])
+        code = solve_stage(f, w, options, tolerances, memory, t + c[j] * h, h, A_stage[j : j + 1])
         if code != DONE and memory[at.IS_FRESH] == 0.0:
             memory[at.HAS_JACOBIAN] = 0.0
             copy(A_stage[j - 1], A_stage[j])
-            code = solve_stage(f, w, options, memory, t + c[j] * h, h, A_stage[j : j + 1])
+            code = solve_stage(f, w, options, tolerances, memory, t + c[j] * h, h, A_stage[j : j + 1])
         if code != DONE:
             memory[at.HAS_JACOBIAN] = 0.0
             return Attempt(code, np.inf, 0.0)

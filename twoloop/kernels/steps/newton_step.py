@@ -15,7 +15,17 @@ for each real eigenvalue l of A, and a complex one for each conjugate pair. They
 import numpy as np
 
 from twoloop.kernels.control.step_size import project_prediction
-from twoloop.kernels.data.common import ATTEMPT, COMMIT, Attempt, Step, allowed_error, compiled, kernel
+from twoloop.kernels.data.common import (
+    ATTEMPT,
+    COMMIT,
+    Attempt,
+    Step,
+    allowed_error,
+    compiled,
+    kernel,
+    max_change_by_rounding,
+    smallest_size,
+)
 from twoloop.kernels.data.indices import DONE, ESTIMATE, FIXED_ORDER, LEAST, OUTER_DIVERGED
 from twoloop.kernels.evaluation.inner_loop import accelerations, evaluate, multipliers
 from twoloop.kernels.linalg.dense import copy
@@ -47,7 +57,7 @@ from twoloop.kernels.steps.velocity_errors import STEPS_TO_DECAY, filtered_veloc
 # the next step computes new derivatives if the last Newton correction exceeds this fraction of the previous one
 SLOW_CONTRACTION = 0.05
 # in steps of fixed size, rounding may prevent that corrections decrease to the tolerance. Newton's method has also
-# converged if the last correction, relative to max(1, |value|), is at most this; otherwise, the step fails
+# converged if the last correction, relative to the max(1, |value|), is at most this; otherwise, the step fails
 MAX_ROUNDING_CORRECTION_FIXED = 1e-9
 
 
@@ -63,9 +73,10 @@ def _solve_stages(f, w, options, memory, t, h, tolerances, q, v, A_stage):
     Q_stage, V_stage = block(memory, s, n, at.Q_STAGE), block(memory, s, n, at.V_STAGE)
     a_new = vector(memory, s, n, at.A_NEW)
     previous_change = 0.0
-    max_rounding = MAX_ROUNDING_CORRECTION_FIXED
+    max_rounding, least_size = MAX_ROUNDING_CORRECTION_FIXED, smallest_size(tolerances)
     if tolerances[ESTIMATE] == 1.0:
         max_rounding = MAX_ROUNDING_CORRECTION * tolerances[LEAST]
+    rounding_limit = 0.0
     for iteration in range(MAX_ITERATIONS):
         w.n_outer += 1
         for j in range(s):
@@ -86,7 +97,7 @@ def _solve_stages(f, w, options, memory, t, h, tolerances, q, v, A_stage):
             if f.form != FIXED_ORDER:  # the fixed-order form treats all coordinates as independent
                 for m in w.dependent:
                     A_stage[j, m] = a_new[m]
-        scale_q, scale_v = 1.0, 1.0
+        scale_q, scale_v = least_size, least_size
         for j in range(s):
             for m in w.independent:
                 scale_q = max(scale_q, abs(Q_stage[j, m]))
@@ -108,21 +119,24 @@ def _solve_stages(f, w, options, memory, t, h, tolerances, q, v, A_stage):
         change = max(h * largest_v / scale_v, h * h * largest_q / scale_q)
         if not np.isfinite(change):
             return OUTER_DIVERGED
+        rounding_limit = max_change_by_rounding(
+            max_rounding, change, h * h * largest_q, h * largest_v, scale_q, scale_v
+        )
         if iteration > 0:
             contraction = change / previous_change if previous_change > 0.0 else 0.0
             memory[at.CONTRACTION] = contraction
             if contraction >= 0.9:
-                return DONE if change <= max_rounding else OUTER_DIVERGED
+                return DONE if change <= rounding_limit else OUTER_DIVERGED
             if contraction / (1.0 - contraction) * change <= options[OUTER_TOL]:
                 return DONE
             # stop early if the corrections cannot fall to the tolerance in the remaining iterations
             n_left = MAX_ITERATIONS - 1 - iteration
-            if change * contraction**n_left / (1.0 - contraction) > max(options[OUTER_TOL], max_rounding):
+            if change * contraction**n_left / (1.0 - contraction) > max(options[OUTER_TOL], rounding_limit):
                 return OUTER_DIVERGED
         elif change <= 1e-3 * options[OUTER_TOL]:
             return DONE
         previous_change = change
-    return DONE if previous_change <= max_rounding else OUTER_DIVERGED
+    return DONE if previous_change <= rounding_limit else OUTER_DIVERGED
 
 
 @compiled
@@ -251,7 +265,7 @@ def newton_step(f, w, options, memory, t, h, tolerances, state, new_state):
             if code != DONE:
                 return Attempt(code, np.inf, 0.0)
             multipliers(f, w, t + dt, q_mid, v_mid, a_mid, w.lam)
-            code = fill_derivatives(f, w, options, memory, s, t + dt, q_mid, v_mid, a_mid)
+            code = fill_derivatives(f, w, options, tolerances, memory, s, t + dt, q_mid, v_mid, a_mid)
             if code != DONE:
                 return Attempt(code, np.inf, 0.0)
             memory[at.HAS_JACOBIAN] = 1.0

@@ -31,7 +31,7 @@ There are three kinds of storage:
 
 import numpy as np
 
-from twoloop.kernels.data.common import compiled, finite_vector, inlined
+from twoloop.kernels.data.common import compiled, finite_vector, inlined, typical_size
 from twoloop.kernels.data.indices import DONE, FIXED_ORDER, NEEDS_DENSE, NOT_FINITE, SINGULAR
 from twoloop.kernels.evaluation.constraints import constraint_rows
 from twoloop.kernels.evaluation.inner_loop import evaluate, find_tangents
@@ -78,7 +78,7 @@ EQUAL_STEP_TOLERANCE = 1e-9  # step sizes count as equal up to this relative dif
 # the last correction is at most this fraction of the smallest tolerance of the run; otherwise, the step fails
 MAX_ROUNDING_CORRECTION = 0.1
 
-RELATIVE_DISPLACEMENT = 1e-7  # displacement of q or v in finite differences, relative to max(1, |value|)
+RELATIVE_DISPLACEMENT = 1e-7  # displacement of q or v in finite differences, relative to `typical_size`
 # if all coordinates are displaced at once, the displacement of coordinate i is multiplied by
 # 1 + DISPLACEMENT_INCREMENT * (i % N_INCREMENTS): the effects of equal displacements might cancel each other
 DISPLACEMENT_INCREMENT, N_INCREMENTS = 0.37, 7
@@ -87,9 +87,15 @@ DISPLACEMENT_INCREMENT, N_INCREMENTS = 0.37, 7
 
 
 @inlined
-def displace_unequally(value, index):
+def displace(value, size):
+    """Return `value` plus a displacement; `size`: see `typical_size`."""
+    return value + RELATIVE_DISPLACEMENT * max(size, abs(value))
+
+
+@inlined
+def displace_unequally(value, size, index):
     """Return `value` plus a displacement that depends on the `index` of the coordinate, see DISPLACEMENT_INCREMENT."""
-    return value + RELATIVE_DISPLACEMENT * max(1.0, abs(value)) * (
+    return value + RELATIVE_DISPLACEMENT * max(size, abs(value)) * (
         1.0 + DISPLACEMENT_INCREMENT * (index % N_INCREMENTS)
     )
 
@@ -125,22 +131,23 @@ def _has_jacobian_changed(f, w, t, q):
 
 
 @compiled
-def _subtract_reaction_tangent(f, w, t, q, moved, b, K):
+def _subtract_reaction_tangent(f, w, tolerances, t, q, moved, b, K):
     """Subtract d(C_q^T lam)/dq, computed by differences, from the entries of K (n_q, n_q) with |i - j| <= b.
 
     w.G must be C_q at (t, q). Coordinates j, j + 2 b + 1, ... are displaced together, as they affect different rows.
     `moved` (n_q) is scratch.
     """
     n = q.size
+    size = typical_size(tolerances, q)
     for j in range(n):
-        moved[j] = displace_unequally(q[j], j)
+        moved[j] = displace_unequally(q[j], size, j)
     if not _has_jacobian_changed(f, w, t, moved):
         return
     width = min(n, 2 * b + 1)
     for group in range(width):
         copy(q, moved)
         for j in range(group, n, width):
-            moved[j] += RELATIVE_DISPLACEMENT * max(1.0, abs(q[j]))
+            moved[j] = displace(q[j], size)
         if not _has_jacobian_changed(f, w, t, moved):
             continue
         for j in range(group, n, width):
@@ -151,7 +158,7 @@ def _subtract_reaction_tangent(f, w, t, q, moved, b, K):
 
 
 @compiled
-def fill_tangent_by_q(f, w, t, q, v, b, moved, K, R):
+def fill_tangent_by_q(f, w, tolerances, t, q, v, b, moved, K, R):
     """Store the entries of d(Q - C_q^T lam)/dq at (t, q, v) with |i - j| <= b in K (n_q, n_q); return a code.
 
     The last evaluation must have been at (t, q, v). `moved` (n_q) and R (n_q, n_q) are scratch.
@@ -165,7 +172,7 @@ def fill_tangent_by_q(f, w, t, q, v, b, moved, K, R):
             for j in range(max(0, i - b), min(q.size, i + b + 1)):
                 K[i, j] -= R[i, j]
     else:
-        _subtract_reaction_tangent(f, w, t, q, moved, b, K)
+        _subtract_reaction_tangent(f, w, tolerances, t, q, moved, b, K)
     return _check_band_finite(K, b)
 
 
@@ -209,14 +216,14 @@ def reduce_to_independents(w, matrix, matrix_T, reduced):
 
 
 @compiled
-def _fill_jacobians_from_tangents(f, w, memory, s, t, q, v):
+def _fill_jacobians_from_tangents(f, w, tolerances, memory, s, t, q, v):
     """Store J_q, J_v (derivatives of accelerations by q_i, v_i), computed from those of the forces; return a code."""
     n = q.size
     m = w.independent.size
     w.n_jacobians += 1
     # the storage of old factors is free now. It receives K (later D), T^T M T, and products such as K T
     K, R = as_matrix(matrix_storage(w, n, at.FILTER), n), as_matrix(matrix_storage(w, n, at.SYSTEMS), n)
-    code = fill_tangent_by_q(f, w, t, q, v, n - 1, vector(memory, s, n, at.Q_MOVED), K, R)
+    code = fill_tangent_by_q(f, w, tolerances, t, q, v, n - 1, vector(memory, s, n, at.Q_MOVED), K, R)
     if code != DONE:
         return code
     AT = matrix_storage(w, n, at.SYSTEMS + 1)[: n * m].reshape((n, m))
@@ -239,14 +246,15 @@ def _fill_jacobians_from_tangents(f, w, memory, s, t, q, v):
 
 
 @compiled
-def _fill_by_differences(f, w, options, t, q, v, a, by_v, q_moved, v_moved, a_new, J):
+def _fill_by_differences(f, w, options, tolerances, t, q, v, a, by_v, q_moved, v_moved, a_new, J):
     """Store in J finite differences of accelerations by q_i (if `by_v`, by v_i); `a`: accelerations at (t, q, v)."""
     base, moved = (v, v_moved) if by_v else (q, q_moved)
+    size = typical_size(tolerances, base)
     for column in range(w.independent.size):
         j = w.independent[column]
         copy(q, q_moved)
         copy(v, v_moved)
-        moved[j] += RELATIVE_DISPLACEMENT * max(1.0, abs(base[j]))
+        moved[j] = displace(base[j], size)
         displacement = moved[j] - base[j]
         code = evaluate(f, w, t, q_moved, v_moved, options[at.INNER_TOL], a_new)
         if code != DONE:
@@ -258,24 +266,25 @@ def _fill_by_differences(f, w, options, t, q, v, a, by_v, q_moved, v_moved, a_ne
 
 
 @compiled
-def _fill_dense_jacobians(f, w, options, memory, s, t, q, v, a):
+def _fill_dense_jacobians(f, w, options, tolerances, memory, s, t, q, v, a):
     """Store J_q and J_v, the derivatives of the accelerations by q_i and v_i; `a`: accelerations at (t, q, v)."""
     if f.force_by_q_given == 1 and w.Rate.size == w.C.size:
-        return _fill_jacobians_from_tangents(f, w, memory, s, t, q, v)
+        return _fill_jacobians_from_tangents(f, w, tolerances, memory, s, t, q, v)
     n = q.size
     m = w.independent.size
     Jq, Jv = as_matrix(matrix_storage(w, n, at.DERIVATIVE_Q), m), as_matrix(matrix_storage(w, n, at.DERIVATIVE_V), m)
     q_moved, v_moved = vector(memory, s, n, at.Q_MOVED), vector(memory, s, n, at.V_MOVED)
     a_new = vector(memory, s, n, at.A_NEW)
     w.n_jacobians += 1
-    code = _fill_by_differences(f, w, options, t, q, v, a, False, q_moved, v_moved, a_new, Jq)
+    code = _fill_by_differences(f, w, options, tolerances, t, q, v, a, False, q_moved, v_moved, a_new, Jq)
     if code != DONE:
         return code
     # displace all velocities at once: if this changes no acceleration, J_v, the derivative by velocities, is zero
     copy(q, q_moved)
+    size = typical_size(tolerances, v)
     for column in range(m):
         j = w.independent[column]
-        v_moved[j] = displace_unequally(v[j], column)
+        v_moved[j] = displace_unequally(v[j], size, column)
     code = evaluate(f, w, t, q_moved, v_moved, options[at.INNER_TOL], a_new)
     if code != DONE:
         return code
@@ -285,7 +294,7 @@ def _fill_dense_jacobians(f, w, options, memory, s, t, q, v, a):
             memory[at.HAS_DAMPING] = 1.0
     if memory[at.HAS_DAMPING] == 0.0:
         return DONE
-    return _fill_by_differences(f, w, options, t, q, v, a, True, q_moved, v_moved, a_new, Jv)
+    return _fill_by_differences(f, w, options, tolerances, t, q, v, a, True, q_moved, v_moved, a_new, Jv)
 
 
 @compiled
@@ -357,7 +366,7 @@ def _update_banded_residual(f, w, t, q, v):
 
 
 @compiled
-def _fill_band(f, w, t, q, v, by_v, base, moved, b, band):
+def _fill_band(f, w, tolerances, t, q, v, by_v, base, moved, b, band):
     """Store in `band` the tangent K, or D if `by_v`, by finite differences at (t, q, v); return DONE or NOT_FINITE.
 
     K and D: derivatives of Q - C_q^T lam by q and v. Columns j, j + 2 b + 1, ... have no rows in common: one difference
@@ -365,10 +374,11 @@ def _fill_band(f, w, t, q, v, by_v, base, moved, b, band):
     """
     n = q.size
     base_point = v if by_v else q
+    size = typical_size(tolerances, base_point)
     for group in range(2 * b + 1):
         copy(base_point, moved)
         for j in range(group, n, 2 * b + 1):
-            moved[j] += RELATIVE_DISPLACEMENT * max(1.0, abs(base_point[j]))
+            moved[j] = displace(base_point[j], size)
         if by_v:
             _update_banded_residual(f, w, t, q, moved)
         else:
@@ -392,11 +402,11 @@ def _copy_band(A, b, band):
 
 
 @compiled
-def _fill_bands_from_callbacks(f, w, memory, s, t, q, v, b):
+def _fill_bands_from_callbacks(f, w, tolerances, memory, s, t, q, v, b):
     """Store the bands of K and D (derivatives of Q - C_q^T lam by q, v), which callbacks provide; return a code."""
     n = q.size
     K, R = matrix_storage(w, n, at.FILTER).reshape((n, n)), matrix_storage(w, n, at.SYSTEMS).reshape((n, n))
-    code = fill_tangent_by_q(f, w, t, q, v, b, vector(memory, s, n, at.Q_MOVED), K, R)
+    code = fill_tangent_by_q(f, w, tolerances, t, q, v, b, vector(memory, s, n, at.Q_MOVED), K, R)
     if code != DONE:
         return code
     _copy_band(K, b, _band_view(matrix_storage(w, n, at.DERIVATIVE_Q), n, b))
@@ -408,7 +418,7 @@ def _fill_bands_from_callbacks(f, w, memory, s, t, q, v, b):
 
 
 @compiled
-def _fill_banded_tangents(f, w, memory, s, t, q, v):
+def _fill_banded_tangents(f, w, tolerances, memory, s, t, q, v):
     """Store the bands of K and D (derivatives of Q - C_q^T lam by q, v), and the arrays of `_border_views`."""
     n = q.size
     b = f.bandwidth
@@ -422,16 +432,19 @@ def _fill_banded_tangents(f, w, memory, s, t, q, v):
     copy_matrix(w.D, D)
     copy(columns_of(w.index), columns)
     if f.force_by_q_given == 1:
-        return _fill_bands_from_callbacks(f, w, memory, s, t, q, v, b)
+        return _fill_bands_from_callbacks(f, w, tolerances, memory, s, t, q, v, b)
     base, moved = vector(memory, s, n, at.A_NEW), vector(memory, s, n, at.Q_MOVED)
     _update_banded_residual(f, w, t, q, v)
     copy(w.Q, base)
-    code = _fill_band(f, w, t, q, v, False, base, moved, b, _band_view(matrix_storage(w, n, at.DERIVATIVE_Q), n, b))
+    code = _fill_band(
+        f, w, tolerances, t, q, v, False, base, moved, b, _band_view(matrix_storage(w, n, at.DERIVATIVE_Q), n, b)
+    )
     if code != DONE:
         return code
     # displace all velocities at once: if this does not change the residual, D, its derivative by velocities, is zero
+    size = typical_size(tolerances, v)
     for j in range(n):
-        moved[j] = displace_unequally(v[j], j)
+        moved[j] = displace_unequally(v[j], size, j)
     _update_banded_residual(f, w, t, q, moved)
     memory[at.HAS_DAMPING] = 0.0
     for i in range(n):
@@ -439,7 +452,9 @@ def _fill_banded_tangents(f, w, memory, s, t, q, v):
             memory[at.HAS_DAMPING] = 1.0
     if memory[at.HAS_DAMPING] == 0.0:
         return DONE
-    return _fill_band(f, w, t, q, v, True, base, moved, b, _band_view(matrix_storage(w, n, at.DERIVATIVE_V), n, b))
+    return _fill_band(
+        f, w, tolerances, t, q, v, True, base, moved, b, _band_view(matrix_storage(w, n, at.DERIVATIVE_V), n, b)
+    )
 
 
 @compiled
@@ -593,7 +608,7 @@ def _fill_sparse_residual(f, w, t, q, v, renews_G, out):
 
 
 @compiled
-def _fill_tangent_entries_by_differences(f, w, t, q, v, by_v, base, residual, moved, entries):
+def _fill_tangent_entries_by_differences(f, w, tolerances, t, q, v, by_v, base, residual, moved, entries):
     """Store in `entries` finite differences of the residual by q (if `by_v`, by v); return DONE or NOT_FINITE.
 
     Columns of a group have no rows in common: one difference yields them all. `base`: residual at (t, q, v);
@@ -601,12 +616,13 @@ def _fill_tangent_entries_by_differences(f, w, t, q, v, by_v, base, residual, mo
     """
     rows, columns, begins = tangent_entries_of(f.newton_program)
     base_point = v if by_v else q
+    size = typical_size(tolerances, base_point)
     for group in range(begins.size - 1):
         copy(base_point, moved)
         first, last = begins[group], begins[group + 1]
         for k in range(first, last):
             j = columns[k]
-            moved[j] = base_point[j] + RELATIVE_DISPLACEMENT * max(1.0, abs(base_point[j]))
+            moved[j] = displace(base_point[j], size)
         if by_v:
             _fill_sparse_residual(f, w, t, q, moved, False, residual)
         else:
@@ -638,7 +654,7 @@ def _has_complete_pattern(f, base, residual, base_point, moved, largest, entries
 
 
 @compiled
-def _fill_sparse_tangents(f, w, memory, t, q, v):
+def _fill_sparse_tangents(f, w, tolerances, memory, t, q, v):
     """Store the sparse K and D (derivatives of the residual by q, v) at the last evaluated state; return a code.
 
     The code is NEEDS_DENSE if there is no program for sparse storage, or if its sparsity pattern lacks entries.
@@ -653,16 +669,18 @@ def _fill_sparse_tangents(f, w, memory, t, q, v):
     copy(w.is_independent, is_independent)
     copy(w.solutions[w.solutions.size - is_independent.size :], stiffness)
     largest = _fill_sparse_residual(f, w, t, q, v, False, base)
-    code = _fill_tangent_entries_by_differences(f, w, t, q, v, False, base, residual, moved, K)
+    code = _fill_tangent_entries_by_differences(f, w, tolerances, t, q, v, False, base, residual, moved, K)
     if code != DONE:
         return code
+    size = typical_size(tolerances, q)
     for j in range(q.size):
-        moved[j] = displace_unequally(q[j], j)
+        moved[j] = displace_unequally(q[j], size, j)
     _fill_sparse_residual(f, w, t, moved, v, True, residual)
     is_complete = _has_complete_pattern(f, base, residual, q, moved, largest, K, pivot_sizes[: q.size])
     copy(jacobian, w.jacobian_values)
+    size = typical_size(tolerances, v)
     for j in range(q.size):
-        moved[j] = displace_unequally(v[j], j)
+        moved[j] = displace_unequally(v[j], size, j)
     _fill_sparse_residual(f, w, t, q, moved, False, residual)
     memory[at.HAS_DAMPING] = 0.0
     for i in range(q.size):
@@ -671,11 +689,11 @@ def _fill_sparse_tangents(f, w, memory, t, q, v):
     if memory[at.HAS_DAMPING] == 0.0:
         D[:] = 0.0
         return DONE if is_complete else NEEDS_DENSE
-    code = _fill_tangent_entries_by_differences(f, w, t, q, v, True, base, residual, moved, D)
+    code = _fill_tangent_entries_by_differences(f, w, tolerances, t, q, v, True, base, residual, moved, D)
     if code != DONE:
         return code
     for j in range(q.size):
-        moved[j] = displace_unequally(v[j], j)
+        moved[j] = displace_unequally(v[j], size, j)
     _fill_sparse_residual(f, w, t, q, moved, False, residual)
     is_complete = _has_complete_pattern(f, base, residual, v, moved, largest, D, pivot_sizes[: q.size]) and is_complete
     return DONE if is_complete else NEEDS_DENSE
@@ -724,16 +742,16 @@ def _filter_error_sparse(f, w, options, s, h, e_q, e_v):
 
 
 @compiled
-def fill_derivatives(f, w, options, memory, s, t, q, v, a):
+def fill_derivatives(f, w, options, tolerances, memory, s, t, q, v, a):
     """Store the derivatives for Newton's matrix at the last evaluated state (t, q, v); return DONE or an error code.
 
     They are derivatives of accelerations in dense storage, else of forces. `a`: accelerations at this state.
     """
     if f.form == FIXED_ORDER:
-        return _fill_sparse_tangents(f, w, memory, t, q, v)
+        return _fill_sparse_tangents(f, w, tolerances, memory, t, q, v)
     if f.bandwidth >= 0:
-        return _fill_banded_tangents(f, w, memory, s, t, q, v)
-    return _fill_dense_jacobians(f, w, options, memory, s, t, q, v, a)
+        return _fill_banded_tangents(f, w, tolerances, memory, s, t, q, v)
+    return _fill_dense_jacobians(f, w, options, tolerances, memory, s, t, q, v, a)
 
 
 @compiled

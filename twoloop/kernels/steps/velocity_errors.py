@@ -13,7 +13,7 @@ two exceptions:
 
 import numpy as np
 
-from twoloop.kernels.data.common import allowed_error, compiled
+from twoloop.kernels.data.common import allowed_error, compiled, typical_size
 from twoloop.kernels.data.indices import DONE, GAP
 from twoloop.kernels.evaluation.inner_loop import evaluate
 from twoloop.kernels.linalg.dense import copy
@@ -123,7 +123,7 @@ def derivatives_agree(f, w, options, memory, s, t, z, tolerances, unfiltered, e_
     copy(v1, V)
     if evaluate(f, w, t, Q, V, options[INNER_TOL], a_base) != DONE:
         return False
-    largest_error, speed = 0.0, 1.0
+    largest_error, speed = 0.0, typical_size(tolerances, V)
     for i in range(w.independent.size):
         largest_error = max(largest_error, abs(e_v[i]))
         speed = max(speed, abs(V[w.independent[i]]))
