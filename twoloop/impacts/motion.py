@@ -372,14 +372,16 @@ class Motion:
         a, c_joints = self._free_accelerations(signs, resting_joints, v)
         gap = self.gaps.evaluate(self.t, self.q, v)
         u, c = gap.u[near], gap.W[near] @ a + gap.bias[near]
-        rounding = ROUNDING * np.abs(v).max() ** 2
-        is_pressed = u * np.abs(u) <= PRESSED_RATIO * self.rebound_height * np.abs(c).max() + rounding
+        sizes = np.abs(gap.W[near])
+        height = np.maximum(self.rebound_height, ROUNDING * (sizes @ np.abs(self.q)))
+        rounding = (ROUNDING * (sizes @ self.speeds)) ** 2
+        is_pressed = u * np.abs(u) <= PRESSED_RATIO * height * np.abs(c).max() + rounding
         W = np.vstack([gap.W[near[is_pressed]], self.modes.gradients(self.q)[resting_joints]])
         D, n = W @ responses(self.system, self.t, self.q, W), int(is_pressed.sum())
         force = holding_forces(D, np.append(c[is_pressed], c_joints), n, self._available_friction(resting_joints))
         pressure = np.zeros(len(near))
         pressure[is_pressed] = (D.diagonal() * force)[:n]
-        return np.asarray(u * np.abs(u) <= 2.0 * self.rebound_height * pressure + rounding, dtype=bool)
+        return np.asarray(u * np.abs(u) <= 2.0 * height * pressure + rounding, dtype=bool)
 
     def _sliding_directions(self, v: Array) -> tuple[Signs, list[int]]:
         """Return the sliding direction of each joint, and the joints at rest."""
@@ -434,7 +436,9 @@ class Motion:
         if system.n_c and (resting or self.modes.n_joints):
             self._project(system, resting)
         if self.arcs or resting:
-            self.q[np.abs(self.q) < NEGLIGIBLE_VALUE] = 0.0
+            largest = float(np.abs(self.q).max())  # where all of q is small, a zero might violate the constraints
+            limit = NEGLIGIBLE_VALUE if largest <= NEGLIGIBLE_VALUE else 1e-10 * largest
+            self.q[np.abs(self.q) < min(limit, NEGLIGIBLE_VALUE)] = 0.0
             self.v[np.abs(self.v) < max(NEGLIGIBLE_VALUE, 1e-16 * float(self.speeds.max()))] = 0.0
         start = self.gaps.evaluate(self.t, self.q, self.v)
         accelerations = self._accelerations(system, cacheable) if resting or STICKS in signs else None
