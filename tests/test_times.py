@@ -29,6 +29,12 @@ def test_a_start_at_the_time_of_a_clock_costs_no_digits(method):
     assert np.isfinite(brief(np.nextafter(1e3, 2e3)).q).all()  # in a step of a few spacings of times
     for span in 10.0 ** np.arange(-9.0, -7.0, 0.2):  # the longest step allowed need not end at one of these times
         assert solve_dae(SWING, (0.1, 0.1 + span), *START, **options).success
+    soon = 1.7e9 + 2e-5  # 84 spacings of times
+    assert solve_dae(SWING, (1.7e9, soon), *START, **options).success
+    free = solve_dae(unconstrained(lambda t, q, v: np.array([-G])), (1.7e9, 1.7e9 + 1.0), [0.0], [3.0], **options)
+    assert free.success and abs(free.q[0, -1] - (3.0 - 0.5 * G)) < 10.0 * tolerance
+    if method != "auto":
+        assert "max_step = 1e-07 is below" in solve_dae(SWING, (1.7e9, soon), *START, max_step=1e-7, **options).message
 
 
 @pytest.mark.parametrize("end", quick([1e15, 1e12]))

@@ -231,6 +231,24 @@ def test_rounding_of_coordinates_that_are_zero_does_not_end_a_motion():
     np.testing.assert_allclose(result.q[::3, -1], expected, atol=1e-5)
 
 
+@pytest.mark.parametrize("across", [0.0, 1e3])
+def test_a_velocity_along_the_floor_does_not_end_the_rebounds(across):
+    falling, floor = unconstrained(lambda t, q, v: np.array([0.0, -1e-6]), 2), Stop(lambda t, q: q[1], 0.5)
+    result = solve_with_stops(falling, (0.0, 14.0), [0.0, 1e-6], [across, 0.0], floor, atol=1e-12)
+    assert result.success and len(result.impacts) == 12, result.message
+
+
+@pytest.mark.parametrize("start", [0.0, 1.7e9])
+def test_impacts_at_the_time_of_a_clock_and_just_before_the_end(start):
+    falling, drop = unconstrained(lambda t, q, v: np.array([-GRAVITY])), np.sqrt(2.0 / GRAVITY)
+    for end in (start + 1.0, *(start + drop + k * np.spacing(start + drop) for k in (-3, 0, 3, 20))):
+        result = solve_with_stops(falling, (start, end), [1.0], [0.0], Stop(lambda t, q: q[0], 1.0))
+        late = result.t[-1] - start - drop
+        assert (
+            result.success and abs(result.q[0, -1] - max(0.0, GRAVITY * drop * late - 0.5 * GRAVITY * late**2)) < 2e-5
+        )
+
+
 EQUAL, UNEQUAL = ([1.0] * 4, [1.0] * 3), ([1.0, 2.0, 1.5, 0.5], [0.3, 0.8, 0.2])  # masses and restitutions
 BALLS = [("sequential", EQUAL, [0, 0, 0, 1.0]), ("moreau", EQUAL, [-0.5, 0.5, 0.5, 0.5])]
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from twoloop.checks.arguments import (
+    NEAR,
     Array,
     check_positive,
     check_span,
@@ -63,6 +64,7 @@ ROUNDING = 1e-13  # rounding errors of gaps and rates, relative to max(1, |q|)
 FIRST_STEP_RATIO = 1e-9  # smallest first step size of an arc, relative to max(1 s, t)
 MIN_TIME_LIMIT = 1e-6  # time limit, s, of an arc that begins after the time limit of the motion
 NEGLIGIBLE_VALUE = 1e-20  # a coordinate (m or rad) or rate (m/s or rad/s) below this value is a rounding error
+ROUNDED_TIMES = 4.0  # largest rounding error of the time of an event, in spacings of floating-point numbers
 MAX_STALLED_TIME = 1e-13  # longest duration of a stalled arc, relative to max(1 s, t)
 MAX_STALLED_ARCS = 30  # number of stalled arcs in a row that ends the motion
 RELEASE_REDUCTION = 1e-7  # relative reduction of the static friction of a joint just released, to avoid chattering
@@ -195,14 +197,16 @@ class Motion:
     def _resolve_contacts(self) -> Mode:
         """Apply an impact; return the mode after it: which joints and stops slide or stick, which stops are closed."""
         gap = self.gaps.evaluate(self.t, self.q, self.v)
-        near_stops = np.flatnonzero(gap.g <= self.rebound_height)
+        # the time of an event is rounded, and the gap closes meanwhile
+        reach = self.rebound_height + ROUNDED_TIMES * np.spacing(abs(self.t)) * np.maximum(-gap.u, 0.0)
+        near_stops = np.flatnonzero(gap.g <= reach)
         is_slow = np.zeros(near_stops.size, dtype=bool)
         if near_stops.size:
             if self._follow_impacts(gap, near_stops):
                 gap = self.gaps.evaluate(self.t, self.q, self.v)
                 # stops that are still open will be hit later, in impacts of their own
                 open_stops = (gap.g > self.noise) & (gap.u < -REST_RATE * (np.abs(gap.W) @ self.speeds))
-                near_stops = np.flatnonzero((gap.g <= self.rebound_height) & ~open_stops)
+                near_stops = np.flatnonzero((gap.g <= reach) & ~open_stops)
             for _ in range(MAX_STALLED_ARCS if near_stops.size else 0):
                 is_slow = self._apply_impulses(gap, near_stops)
                 gap = self.gaps.evaluate(self.t, self.q, self.v)
@@ -476,6 +480,8 @@ class Motion:
             needs_traces = isinstance(check_method(options["method"]), Taylor | Lobatto16)
             options |= {"method": PRESETS["auto"] if needs_traces else options["method"], "compiled": False}
         arc = solve_dae(system, (self.t, t1), self.q, self.v, events=events, dense_output=True, **options)
+        if 0.0 < t1 - arc.t[-1] <= NEAR * np.spacing(abs(t1)):  # an event so near t1 leaves no time for another arc
+            arc = solve_dae(system, (self.t, t1), self.q, self.v, dense_output=True, **options)
         self.arcs.append(arc)
         ended = {k for k in range(len(events)) if arc.t_events is not None and arc.t_events[k].size}
         self.friction.update(

@@ -72,6 +72,7 @@ def prepare_workspace(w, numbers, integers, pattern, q, accuracy, reuse):
 
 FIRST_STEP = 0.01  # first step size, relative to the shortest time scale of the initial motion, see _first_step_size
 MIN_FIRST_STEP = 1e4  # smallest first step size, in spacings of floating-point numbers at the start time
+MIN_GAP = 40.0  # least limit of the time between two evaluations, in spacings of floating-point numbers
 SHORTEST_STEP = 1e-16  # a run fails if a step would be shorter than this fraction of the first step
 # if forces may change suddenly with q or v, steps that check their defect evaluate the equations this number of times
 # as often: DEFECT_GAP, the time (s) allowed between two evaluations, is this number of times shorter than GAP
@@ -101,13 +102,12 @@ def _first_step_size(state, n, t, span, smallest):
 
 
 @exact
-def _set_step_limits(control, tolerances, span, longest, within):
-    """Store limits of step sizes and of samples, so that forces are evaluated at least every MAX_GAP_RATIO * span (s).
+def _set_step_limits(control, tolerances, t, t1, longest, within):
+    """Store limits of step sizes and samples; forces are evaluated at least every MAX_GAP_RATIO * (t1 - t) seconds.
 
-    `span`: duration of the run (s). If the method adds evaluations within steps (`within`), the step size is limited
-    only by `longest` (s).
+    If the method adds evaluations within steps (`within`), the step size is limited only by `longest` (s).
     """
-    max_gap = MAX_GAP_RATIO * span
+    max_gap = max(MAX_GAP_RATIO * (t1 - t), MIN_GAP * np.spacing(max(abs(t), abs(t1))))
     tolerances[GAP], tolerances[DEFECT_GAP] = max_gap, max_gap / (GAP_RATIO if control[at.BY_STATE] > 0.0 else 1.0)
     control[at.MAX_STEP] = longest if within else min(longest, max_gap / control[at.MAX_EVALUATION_GAP])
     control[at.TIME_SPACING] = max_gap / N_SAMPLES
@@ -118,7 +118,7 @@ def _set_step_limits(control, tolerances, span, longest, within):
 def first_step_and_limits(control, tolerances, state, n, t, t1, smallest, longest, within):
     """Call `_set_step_limits` if `longest` (s) is above 0; return the result of `_first_step_size` (s)."""
     if longest > 0.0:
-        _set_step_limits(control, tolerances, t1 - t, longest, within)
+        _set_step_limits(control, tolerances, t, t1, longest, within)
     return _first_step_size(state, n, t, t1 - t, smallest)
 
 
@@ -301,7 +301,7 @@ def _start_run(f, checked_kit, w, b, t, t1, q, v, records, checks):
     w.next_jump = t1
     if b.control[at.FIXED_STEP] == 0.0:
         span, h, within = t1 - t, b.constants[FIRST_SIZE], b.constants[EVALUATES_WITHIN] > 0.0
-        _set_step_limits(b.control, b.tolerances, span, b.constants[LONGEST], within)
+        _set_step_limits(b.control, b.tolerances, t, t1, b.constants[LONGEST], within)
         first_size = h if h > 0.0 else _first_step_size(b.state, n, t, span, b.constants[LEAST_DISTANCE])
         b.clock[at.H_NEXT] = min(first_size, span)
         b.control[at.SHORTEST] = SHORTEST_STEP * b.clock[at.H_NEXT]

@@ -342,6 +342,9 @@ def status_and_message(run: "Run", code: int, t1: float, stall: StallDetector) -
             f"{stopped}: with the fixed step_size = {run.control[a.FIXED_STEP]:g} {reason}. Take a smaller "
             "step_size, or leave it out for step-size control.",
         )
+    if run.max_step <= np.spacing(abs(t)):
+        limit = f"max_step = {run.max_step:g} is below the spacing of floating-point numbers, {np.spacing(abs(t)):.2g}"
+        return Status.STEP_TOO_SMALL, f"{stopped}: {limit}. Raise max_step, or let t_span begin at 0."
     least_ratio, words = least_inertia(run.system, t, run.state[: run.system.n_q])
     massless = f"There {words}. " if least_ratio < MAX_SINGULAR_RATIO else ""
     return (

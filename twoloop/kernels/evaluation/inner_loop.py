@@ -65,7 +65,7 @@ def compute_gamma(f, w, t, q, v):
         first = n_c
     if n_rows == n_c or has_gamma_a:
         last = n_c
-    if (last > n_c or not has_gamma) and not gamma_by_program(f, w, t, q, v):
+    if last > first and not gamma_by_program(f, w, t, q, v):
         code = gamma_by_differences(f, w, t, q, v, first, last)
         if code != DONE:
             return code
