@@ -136,13 +136,12 @@ def _is_within_bounds(t, rows, bounds):
 
 @kernel(types.void(MATRIX, INTEGERS, VECTOR, types.int64[:, ::1], types.boolean[::1]))
 def split_steps(steps, counts, h, changes, used_newton):
-    """Split the records of steps, `steps` (rows of out_steps, see loop_state.py), into three arrays.
+    """Split the records of steps, `steps` (rows of out_steps, see loop_state.py), into arrays with an entry per step.
 
-    - h: step sizes (s)
-    - changes: rows: numbers of rejections by the error test, of failures, and of new partitions before each step
-    - used_newton: True for a step by Newton's method
-
-    `counts`: the same three numbers, since the start of the run: before the first step; on return, after the last.
+    `h` receives the step sizes (s), `used_newton` True for steps by Newton's method. The three rows of `changes` count
+    events since the previous step: rejections by the error test, failed steps, and new partitions.
+    On entry, `counts` contains how many of these events happened before the first step of `steps`, since the start of
+    the run; on return, how many happened until the last step.
     """
     for k in range(h.size):
         h[k], used_newton[k] = steps[k, at.H], steps[k, at.JACOBIANS] > 0.0
@@ -195,7 +194,7 @@ RUN_ARRAYS.add_function("advance", i8(KIT, WORK, *(VECTOR,) * 9, MATRIX, MATRIX,
     WEAK_LIMIT,  # M counts as singular if the ratio of its smallest to its largest eigenvalue is below this
     ADDED_SCALE,  # factor s: for a singular M, generated code uses M + s g^T g instead, where g are some rows of G
     CONTRADICTS,  # refuse a start if a row of G a = gamma has a larger residual, relative to 1 or the sum of |terms|
-    MASS_FLAG,  # DEFINITE or INDEFINITE: a start is refused if M is not so; 0: M is constant, and not checked
+    MASS_FLAG,  # a start is refused unless the check of M returns this: DEFINITE, INDEFINITE, or 0 for a constant M
     LEAST_PIVOT,  # a start is refused if the smallest pivot of C_q there is below this
     EQUATION_FORM,  # initial f.form, the algebra that solves for accelerations
     FIRST_SIZE,  # first step size (s) that the user has chosen; 0: it is computed

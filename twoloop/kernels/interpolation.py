@@ -1,7 +1,7 @@
 """Interpolate states within steps by polynomials through neighbouring states, and project the results.
 
 Row i of `states` is [q, v, a] at the time t[i]; interval i is between rows i and i + 1. If a method takes long steps,
-`fill_intervals` first computes states within an interval, which its polynomial interpolates. (`f`: kit, `w`: workspace)
+`fill_intervals` first computes states within an interval, for its polynomial to interpolate. `f`: kit, `w`: workspace.
 """
 
 import numpy as np
@@ -19,14 +19,13 @@ CHECKED_FRACTIONS = (0.3, 0.7)  # times at which polynomials are checked, as fra
 N_CHECKED_TIMES = len(CHECKED_FRACTIONS)
 EPS = 2.0**-52  # spacing of floating-point numbers at 1
 MAX_GAP_RATIO = 8.0  # neighbouring steps count as equally long if the longest is at most this multiple of the shortest
-# v has a polynomial of its own if (rounding error of q) / (duration of the interval) exceeds this number of tolerances
+# v is interpolated, not the derivative of q, if (rounding error of q) / (duration) exceeds this number of tolerances
 MAX_VELOCITY_ROUNDING = 10.0
-# "pivot ratio": smallest / largest pivot at a position, see min_pivot_ratio in partition.py. A position is singular if
-# its pivot ratio is below SINGULAR_PIVOT, or below SINGULAR_PIVOT_RATIO times the larger one at the interval's ends
-SINGULAR_PIVOT_RATIO = 0.01
-SINGULAR_PIVOT = 1e-5
-# (pivot ratio) * (change of v by the projection) estimates by how much v violated the constraints. If this is less than
-# MAX_VIOLATION tolerances, rounding may explain the change: a position with a pivot ratio below WEAK_PIVOT is singular
+# pivot ratio: smallest / largest pivot of the constraint Jacobian at a position, see min_pivot_ratio in partition.py
+SINGULAR_PIVOT_RATIO = 0.01  # singular: a position with a pivot ratio below this part of that at an end of the interval
+SINGULAR_PIVOT = 1e-5  # singular: a position with a pivot ratio below this
+# a position with a pivot ratio below WEAK_PIVOT is singular if v before the projection violated the constraints by less
+# than MAX_VIOLATION tolerances, so that rounding may explain the change of v; estimate: (pivot ratio) * (change of v)
 MAX_VIOLATION, WEAK_PIVOT = 10.0, 0.05
 
 
@@ -45,12 +44,12 @@ def _node_range(low, high, i, last):
 
 @compiled
 def _divided_differences(t, states, lo, hi, i, h, column, order, z, c):
-    """Compute the Hermite polynomials through rows lo to hi of `states`; return the number of their coefficients.
+    """Compute the Hermite polynomials through rows lo to hi of `states`; return the number of coefficients of each.
 
-    There are n polynomials, one for each of the n columns of `states` from index `column` on; the next n columns are
-    their first derivatives, and the next n their second derivatives. Row i is subtracted from the values. `order` is
-    the number of interpolated numbers at each time: 2 for a value and its first derivative, 3 with the second one.
-    Store the coefficients of Newton's form in c, and the interpolated times in z, as (time - t[i]) / h.
+    There are n polynomials, for the n columns of `states` from index `column` on. The next n columns contain the first
+    derivatives, and the next n columns the second derivatives. Row i is subtracted from the values. `order`: 2 to
+    interpolate values and first derivatives, 3 to interpolate second derivatives, too. Store the coefficients of
+    Newton's form in c, and the interpolated times in z, as (time - t[i]) / h; h: duration of the interval.
     """
     n = c.shape[1]
     n_coefficients = (hi - lo + 1) * order
@@ -77,7 +76,7 @@ def _evaluate_polynomials(states, i, kind, h, s, z, c, size, z_v, c_v, size_v, q
     """Store in q and v the values of the polynomials of an interval at the time t[i] + s h; h: duration.
 
     (z, c, size): interpolated times, coefficients and their number, for the polynomials of q. If `kind` is SEPARATE,
-    (z_v, c_v, size_v) are the same for v; otherwise v is the derivative of the polynomials of q.
+    (z_v, c_v, size_v) describe polynomials of v; otherwise v is the derivative of the polynomials of q.
     """
     n = q.size
     for m in range(n):
@@ -113,7 +112,7 @@ def _fit_polynomials(tolerances, t, states, group, z_q, c_q, z_v, c_v):
     Return
     - the kind and the duration (s) of the interval
     - the indices of the first and last interpolated state
-    - how many numbers of q the polynomials interpolate at each time: 2 (q, v) or 3 (q, v, a)
+    - what the polynomials of q interpolate at each time: 2 if q and v, 3 if q, v and a
     - the number of coefficients of each polynomial of q, and of v (0 if v has none)
     """
     i, last, kind = group[kinds.FIRST_OWN], group[kinds.LAST_OWN], group[kinds.KIND]
@@ -220,13 +219,13 @@ def _state_difference(tolerances, scale_q, scale_v, states, i, q, v, q_other, v_
         change_q = scale_q * abs(q_other[m] - q[m]) / (atol + rtol * abs(states[i, m]))
         change_v = scale_v * abs(v_other[m] - v[m]) / (atol + rtol * abs(states[i, n + m]))
         largest, total = max(largest, change_q, change_v), total + change_q + change_v
-    # not finite where the times of two interpolated states coincide, as in a step of a few spacings of times
+    # `total` is not finite if the times of two interpolated states coincide, as in a step of a few spacings of times
     return largest if np.isfinite(total) else np.inf
 
 
 @merged
 def _evaluate_accelerations(kind, h, s, z, c, size, z_v, c_v, size_v, a):
-    """Store accelerations at t[i] + s h, derivatives of the polynomials, in `a`; see `_evaluate_polynomials`."""
+    """Store in `a` derivatives of the polynomials: accelerations at t[i] + s h. See `_evaluate_polynomials`."""
     for m in range(a.size):
         value, slope, curvature = c[size - 1, m], 0.0, 0.0
         for r in range(size - 2, -1, -1):
@@ -257,14 +256,14 @@ def estimate_errors(f, w, tolerance, tolerances, t, states, groups, z, coefficie
     """Store in out[g] the estimated error of the polynomials of interval g of `groups`, in units of the tolerances.
 
     The estimate is the first of these that applies (`tolerance`: of the projection; z, coefficients, rows: scratch):
-    - 0, if the kind is SEPARATE or VELOCITIES, and the polynomials interpolate more than two states, which are at about
-      equal distances and not inside the interval
-    - with more than two interpolated states: how much the polynomials change if they do not interpolate the last state.
-      This applies if the change is at most 1. It always applies to the kind VELOCITIES, because accelerations, which
-      the next estimate needs, then contain the noise of stiff modes
-    - the larger of two differences at CHECKED_FRACTIONS: of the state before and after its projection; and of the
-      accelerations by the polynomials and by the equations of motion. The latter, times h / (number of coefficients),
-      counts as an error of velocities
+    - 0, if the kind is SEPARATE or VELOCITIES, and the polynomials interpolate more than two states, which are about
+      equally spaced and not inside the interval
+    - the change of the polynomials if they do not interpolate the last state. This needs more than two states, and a
+      change of at most 1. For the kind VELOCITIES, any change will do: the next estimate needs accelerations, which
+      contain the noise of stiff modes for this kind
+    - the larger of two differences at CHECKED_FRACTIONS: between a state before and after its projection; and between
+      accelerations by the polynomials and by the equations of motion. The latter, times dt = h / (number of
+      coefficients), counts as an error of velocities, and times dt^2 as an error of positions
     """
     n = w.Q.size
     half = z.size // 2
@@ -316,7 +315,7 @@ def estimate_errors(f, w, tolerance, tolerances, t, states, groups, z, coefficie
 
 @kernel(i8(KIT, WORK, VECTOR, MATRIX, MATRIX))
 def fill_accelerations(f, w, times, states, out):
-    """Store [a, lam] at consistent states [q, v] in the rows of `out`; failures become NaN; return their number."""
+    """Store [a, lam] at consistent states [q, v] in rows of `out`, NaN on failure; return the number of failures."""
     n = w.Q.size
     code = SINGULAR
     failures = 0

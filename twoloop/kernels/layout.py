@@ -14,9 +14,9 @@ from twoloop.kernels.data.indices import N_COUNTERS, N_NOTES
 from twoloop.kernels.linalg.band import N_ROUTINES
 from twoloop.kernels.linalg.markowitz_lu import MAX_ENTRIES_PER_LINE, N_COUNTS, N_LISTS, index_size, values_size
 
-# largest number of unused workspaces that are kept for later runs; a workspace with more floats is not kept
+# at most MAX_UNUSED unused workspaces are kept for later runs, each with at most MAX_UNUSED_SIZE floats
 MAX_UNUSED, MAX_UNUSED_SIZE = 32, 100_000
-WORD, LINE = 8, 8  # bytes in a number; numbers in a cache line: each array begins at the start of a cache line
+WORD, LINE = 8, 8  # WORD: bytes in a number; LINE: numbers in a cache line, at the start of which an array begins
 
 
 class FixedOrderSizes(NamedTuple):
@@ -30,8 +30,8 @@ class FixedOrderSizes(NamedTuple):
 
 
 # arguments of _create_layout: numbers of coordinates, of rows of C_q, of rows of A (non-holonomic); ranks of C_q and of
-# [C_q; A]; True if accelerations follow from T^T M T (T: null space of the constraints); True if they follow from the
-# augmented matrix; number of operations of traced programs; FixedOrderSizes or None; length of the array `matrices`
+# [C_q; A]; True to allocate the arrays of the null-space form; True to allocate those of the augmented form; number of
+# nodes of traced programs; FixedOrderSizes, or None in other forms; length of the array `matrices`
 Sizes = tuple[int, int, int, int, int, bool, bool, int, FixedOrderSizes | None, int]
 ArrayRanges = list[tuple[str, int, int, tuple[int, ...]]]  # for each array: name, first offset, end, shape
 
@@ -97,7 +97,7 @@ def _allocate_workspace(sizes: Sizes) -> Work:
 
 
 def keep_unused_workspace(work: Work) -> None:
-    """Keep a workspace for later runs, unless it is large; over MAX_UNUSED, discard those of sizes used longest ago."""
+    """Keep a workspace for later runs unless it is large; above MAX_UNUSED, discard those of sizes used longest ago."""
     unused = _unused_workspaces.pop(work.sizes, [])
     if work.notes.base.size <= MAX_UNUSED_SIZE and len(unused) < MAX_UNUSED:
         unused.append(work)

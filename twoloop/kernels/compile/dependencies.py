@@ -117,7 +117,7 @@ class Digest:
                 self.helpers.append(helper)
 
     def _add_module(self, module: types.ModuleType) -> None:
-        """Add a module's name and, unless it is a library, those of its attributes whose names are in `self.names`."""
+        """Hash the name of a module and, unless it is a library, its attributes that have names in `self.names`."""
         self.hash.update(module.__name__.encode())
         if not is_library(module.__name__):
             for name in sorted(self.names & set(vars(module))):

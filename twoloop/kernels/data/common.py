@@ -89,7 +89,7 @@ class Work(NamedTuple):
     values_v: Any  # factors of G_d, the dependent columns of the constraint Jacobian G
     index_a: Any  # list of operations that factors the augmented matrix [M G^T; G 0]; index_a[SIZE] = 0: no list yet
     values_a: Any  # factors of the augmented matrix; empty in other forms than AUGMENTED
-    right: Any  # (2 (n_q + r_v)) right-hand side of equations with the augmented matrix, then scratch
+    right: Any  # (2 (n_q + r_v)), r_v: rank of G. First half: right-hand side for the augmented matrix; then scratch
     order: Any  # (n_q) scratch: order of the columns in full pivoting
     row_order: Any  # (n_c + n_a) scratch: order of the rows in full pivoting
     counters: Any  # (N_COUNTERS) numbers of steps, iterations, evaluations etc. in the run, see indices.py

@@ -82,7 +82,7 @@ def gather_independent_columns(G, rate, rows, independent, D):
         D[independent.size, k] = -rate[rows[k]]
 
 
-# `largest_difference_step` is at most MAX_DIFFERENCE_STEP (s) and, in fast motion, at least MIN_STEP_RATIO times this
+# `largest_difference_step` returns at most MAX_DIFFERENCE_STEP (s), and at least MIN_STEP_RATIO * MAX_DIFFERENCE_STEP
 MAX_DIFFERENCE_STEP, MIN_STEP_RATIO = 2e-4, 1e-4
 N_DIFFERENCE_STEPS = 12  # number of time steps that `_choose_difference_step` tries, each a quarter of the previous one
 # if Gamma with the time step e differs from Gamma with 2 e by at most this part of its size, rounding may be the reason
@@ -107,7 +107,7 @@ def representable_step(t, h):
 def largest_difference_step(q, v):
     """Return the largest time step (s) of finite differences: MAX_DIFFERENCE_STEP, or less if coordinates move fast.
 
-    In this time, they move by at most MAX_DIFFERENCE_STEP / (1 s) times max|q|, unless MIN_STEP_RATIO limits the step.
+    If max|v| exceeds max|q| (in SI units), the step is multiplied by max|q| / max|v|, but at least by MIN_STEP_RATIO.
     """
     size, speed = largest_of(q), largest_of(v)
     if speed <= size:

@@ -11,17 +11,17 @@ import math
 
 from twoloop.kernels.data.common import compiled, exact
 
-# kinds of operations. SUM: a sum of terms, without a function. RESULT: the same, for an output of a program. PENDING,
-# in Taylor series: a product x y where the coefficient of order k of y is an unknown of the linear equations of order k
+# kinds of operations. SUM is a sum of terms; RESULT is a sum of terms that is an output of the program. PENDING is a
+# product x y in a Taylor series; the coefficient of order k of y is an unknown of linear equations for the order k
 PRODUCT, RECIPROCAL, SQUARE_ROOT, EXPONENTIAL, SINE, COSINE, LOGARITHM, ARCTANGENT, PENDING, SUM, RESULT = range(11)
 # columns of the table of a program, which has one row for each operation. `nodes` are the numbers that the program
 # reads and computes. Each argument of an operation is a constant plus terms; a term is a coefficient times a node.
-# - KIND: kind of the operation, such as SINE; NODE: index of its result in `nodes`
-# - FIRST, SECOND, END: in the list of terms, argument 1 has the terms FIRST to SECOND - 1, argument 2 SECOND to END - 1
+# - KIND: kind of the operation, such as SINE; NODE: index of the operation's result in `nodes`
+# - FIRST, SECOND, END: terms FIRST to SECOND - 1 of the list of terms make argument 1, SECOND to END - 1 argument 2
 KIND, NODE, FIRST, SECOND, END, N_COLUMNS = range(6)
-# indices in a program, a vector of integers that begins with four sizes: the numbers of nodes, rows, terms and results.
-# The rows of the table follow; then, for each term, the index of its node; then, for each result, its index in w.Gamma
-# or in the flattened C_q. The last nodes are the results
+# A program is a vector of integers. It begins with the numbers of nodes, rows, terms and results, at the indices below.
+# Then follow the rows of the table; for each term, the index of the node that it multiplies; and for each result, the
+# index of the result in w.Gamma or in the flattened C_q. The results are the last nodes
 N_NODES, N_ROWS, N_TERMS, N_RESULTS, N_SIZES = range(5)
 
 
@@ -51,7 +51,7 @@ def result_of_operation(kind, x, y):
 
 @exact
 def affine_sum(nodes, table, columns, numbers, coefficients, constant, begin, end):
-    """Return an argument of an operation: numbers[constant] plus its terms `begin` to end - 1, see `run_table`."""
+    """Return an argument of an operation: numbers[constant] plus terms number `begin` to end - 1, see `run_table`."""
     total = numbers[constant]
     for k in range(begin, end):
         total = total + numbers[coefficients + k] * nodes[int(table[columns + k])]
@@ -60,11 +60,11 @@ def affine_sum(nodes, table, columns, numbers, coefficients, constant, begin, en
 
 @exact
 def run_table(table, rows, n_rows, columns, numbers, coefficients, constants, nodes, inputs, t, q, v):
-    """Do the operations of a table: store t, q, v in `nodes` from index `inputs` on, then the results of operations.
+    """Do the operations of a program: store t, q, v in `nodes` from index `inputs` on, then the results of operations.
 
-    `table` contains integers, or whole floats if it is among the parameters of a model. In `table`, the rows, one for
-    each operation, begin at index `rows`; the list of the terms' indices in `nodes` at `columns`. In `numbers`, the
-    coefficients of the terms begin at index `coefficients`, and the constants, two for each row, at index `constants`.
+    The vector `table` (integers, or floats without a fraction) contains a row for each operation, from index `rows` on,
+    and for each term the index of its number in `nodes`, from index `columns` on. The vector `numbers` contains the
+    coefficients of terms from index `coefficients` on, and two constants for each row from index `constants` on.
     """
     nodes[inputs] = t
     for j in range(q.size):
@@ -80,7 +80,7 @@ def run_table(table, rows, n_rows, columns, numbers, coefficients, constants, no
 
 @exact
 def _run_program(program, numbers, nodes, t, q, v):
-    """Run a program that replaces a callback: fill `nodes` with t, q, v and results (`numbers`: its constants)."""
+    """Run a program that replaces a callback: store t, q, v and results in `nodes`; `numbers`: constants it uses."""
     n_rows = program[N_ROWS]
     columns = N_SIZES + N_COLUMNS * n_rows
     run_table(program, N_SIZES, n_rows, columns, numbers, 2 * n_rows, 0, nodes, 0, t, q, v)
@@ -88,7 +88,7 @@ def _run_program(program, numbers, nodes, t, q, v):
 
 @exact
 def _result_indices(program):
-    """Return the number of results, and indices: of the first in `nodes`, and of their output indices in `program`."""
+    """Return how many results a program has, where they begin in `nodes`, and where `program` lists their outputs."""
     n = program[N_RESULTS]
     return n, program[N_NODES] - n, N_SIZES + N_COLUMNS * program[N_ROWS] + program[N_TERMS]
 
@@ -110,7 +110,7 @@ def gamma_by_program(f, w, t, q, v):
 
 @compiled
 def jacobian_by_program(f, w, t, q, G):
-    """Store C_q in G (zero on entry) by a traced program; return False if none exists, or a value is not finite."""
+    """Store C_q in G (zero on entry) by a traced program; return False without a program, or for non-finite values."""
     program = f.jacobian_program
     if program.size == 0:
         return False

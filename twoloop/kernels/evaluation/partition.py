@@ -36,10 +36,10 @@ from twoloop.kernels.linalg.markowitz_lu import (
     solve_rows,
 )
 
-RANK_TOLERANCE = 1e-11  # pivots up to this limit count as zero, if rows are scaled to maxima of 1 first
+RANK_TOLERANCE = 1e-11  # a pivot, or the ratio of the smallest to the largest pivot, counts as zero up to this limit
 PARTITION_CHANGED = -1  # return code: the task succeeded, as for DONE, and the partition has changed
 MAX_ROWS_ELIMINATED = 200  # with more independent constraints, `min_pivot_ratio` does no elimination, to save time
-# a partition is poor if the sensitivity of its dependent coordinates exceeds this multiple of the first known value
+# a partition is poor if the sensitivity of dependent to independent coordinates exceeds its first value by this factor
 SENSITIVITY_GROWTH = 3.0
 
 
@@ -110,8 +110,8 @@ def min_pivot_ratio(f, w, t, q):
     """Return the ratio of the smallest to the largest pivot of [C_q; A] at (t, q), to detect singular positions.
 
     A: rows of the non-holonomic constraints. The ratio is 0 if the rank is lower than before. Rows are not scaled,
-    because scaling would hide that a row has a small norm at a singular position. To save time, return w.pivot instead
-    in the fixed-order form (of its last factors), or with more than MAX_ROWS_ELIMINATED rows (of the last partition).
+    because scaling would hide that a row has a small norm at a singular position. In the fixed-order form, or with more
+    than MAX_ROWS_ELIMINATED rows, return w.pivot to save time: the smallest pivot of the last factors or partition.
     """
     if f.form == FIXED_ORDER or w.rows_v.size > MAX_ROWS_ELIMINATED:
         return w.pivot
@@ -131,7 +131,7 @@ def min_pivot_ratio(f, w, t, q):
 
 @compiled
 def _pivot_rows(w, n_rows, max_rank):
-    """Eliminate in the first `n_rows` rows of w.Gx by full pivoting; store w.order, w.row_order; return the rank."""
+    """Find pivots in w.Gx[:n_rows]; store orders of columns (w.order) and rows (w.row_order); return the rank."""
     for j in range(w.order.size):
         w.order[j] = j
     for i in range(w.row_order.size):
@@ -143,8 +143,8 @@ def _pivot_rows(w, n_rows, max_rank):
 def _find_pivot_order(w, max_rank, max_rank_v):
     """Find pivots of w.Gx = [C_q; A], first in C_q, then in A, the rows of the non-holonomic constraints.
 
-    Store the indices of their rows in w.row_order, and of their columns in w.order. Return the rank of C_q, at most
-    `max_rank`, and the rank of [C_q; A], at most `max_rank_v`.
+    Store the indices of the pivots' rows in w.row_order, and of the pivots' columns in w.order. Return the rank of C_q,
+    at most `max_rank`, and the rank of [C_q; A], at most `max_rank_v`.
     """
     G, order, row_order = w.Gx, w.order, w.row_order
     n_c, n_rows = w.C.size, w.Rate.size
@@ -186,10 +186,10 @@ def _copy_in_ascending_order(source, target):
 
 @compiled
 def _adopt_pivot_order(w):
-    """Store a new partition, and write programs that factor its dependent columns of the Jacobian w.G.
+    """Store the partition that `_find_pivot_order` has found, and write programs that factor its dependent columns.
 
-    The first indices in w.row_order and w.order, those of the pivots, become independent rows and dependent
-    coordinates. Return False if the dependent columns are singular.
+    Rows of pivots become independent rows, and columns of pivots become dependent coordinates. Return False if the
+    columns of the dependent coordinates in the Jacobian w.G are singular.
     """
     rank, rank_v = w.rows.size, w.rows_v.size
     # indices are stored in ascending order, so that equal sets of coordinates are equal partitions
@@ -238,7 +238,7 @@ def _record_columns_of_entries(w):
 
 @compiled
 def record_entries(w):
-    """Set w.pattern to 1 where w.G is not zero; return True if an entry is new: eliminations need new programs."""
+    """Set w.pattern to 1 where w.G is not zero; return True if w.pattern changes: eliminations need new programs."""
     if not update_pattern(w.G, w.pattern):
         return False
     w.index_a[SIZE] = 0
@@ -249,8 +249,8 @@ def record_entries(w):
 def choose_partition(f, w, t, q):
     """Choose and store the dependent and independent coordinates and the independent rows at (t, q); return a code.
 
-    Codes: DONE; SINGULAR if the rank is lower than for the previous partition; RANK_DIFFERS if this is the first
-    partition and the workspace is allocated for other ranks. Then the ranks are stored in w.rank and w.rank_v.
+    Codes: DONE; SINGULAR if a rank is lower than in the previous partition; RANK_DIFFERS if this is the first partition
+    and the workspace is allocated for other ranks: then w.rank becomes the rank of C_q, and w.rank_v that of all rows.
     """
     w.entries[:] = 0.0
     constraint_rows(f, w, t, q, w.G)
@@ -324,7 +324,7 @@ def choose_oriented_partition(f, w, t, q):
 
 @compiled
 def _largest_coefficient(w):
-    """Return the largest |coefficient| of an independent row in a redundant row, for rows scaled to maxima of 1."""
+    """Return the largest |coefficient| of an independent row in the sum that equals a redundant row (maxima: 1)."""
     rows = rows_of(w.index_v)
     largest = 0.0
     begin = 0
@@ -344,10 +344,10 @@ def _largest_coefficient(w):
 def partition_is_poor(w):
     """Return True if the dependent coordinates have become so sensitive that a new partition is needed.
 
-    Their sensitivity to the independent coordinates is max|C_qd^-1 C_qi| (w.D); C_qd and C_qi are the columns of the
-    dependent and the independent coordinates in C_q. It is near 1 after full pivoting, and grows without bound where
-    the independent coordinates stop being valid. Also return True if the largest coefficient of an independent row in a
-    redundant row has grown: it grows where independent rows become dependent while the rank stays the same.
+    The sensitivity to the independent coordinates is max|C_qd^-1 C_qi| (w.D); C_qd and C_qi are the columns of the
+    dependent and the independent coordinates in C_q. The sensitivity is near 1 after full pivoting, and grows without
+    bound where the independent coordinates stop being valid. Also return True if `_largest_coefficient` has grown: this
+    happens where independent rows become dependent while the rank stays the same.
     """
     largest = 0.0
     for j in range(w.independent_v.size):
@@ -369,15 +369,15 @@ def partition_is_poor(w):
 MAX_ITERATIONS = 25  # largest number of Newton iterations for positions; quadratic convergence needs 2 to 5
 CONTRACTION = 0.5  # Newton's method counts as converging while each correction is at most this part of the previous one
 ROUNDING_OF_CORRECTIONS = 1e-12  # corrections of positions up to this size, relative to max|q|, may be due to rounding
-# if all constraints hold up to rounding, larger corrections may be due to rounding: up to this factor times
-# ROUNDING_OF_CORRECTIONS. A rounding error of a position of 1 m turns a rod of 1 mm by 1e-13 rad, a chain by more
+# if all constraints hold up to rounding, the limit ROUNDING_OF_CORRECTIONS is multiplied by this factor. Reason: a
+# rounding error of a position of 1 m turns a rod of 1 mm by 1e-13 rad, and a chain of rods by more
 AMPLIFICATION = 1e3
 # constraint C_i = 0 holds up to rounding if |C_i| is at most this fraction of its largest term: the largest |G_ij q_j|
 # over the coordinates q_j, with the Jacobian G = C_q
 ROUNDING_OF_ROWS = 2e-15
-MIN_CORRECTION = 10.0  # a projection's tolerance for corrections is at least this number times w.rounded, rounding of q
-# constraint i is violated if |C_i| exceeds this fraction of max(1, max|q|) times the largest entry of its Jacobian row,
-# or if |(C_q v + C_t)_i| exceeds this fraction of max(1, max|v|) times this entry
+MIN_CORRECTION = 10.0  # the tolerance of a projection is at least this multiple of w.rounded, the rounding error of q
+# let g be the largest |entry| of row i of the Jacobian C_q. Constraint i is violated if |C_i| exceeds this number times
+# g max(1, max|q|), or if |(C_q v + C_t)_i| exceeds this number times g max(1, max|v|)
 MAX_VIOLATION = 1e-7
 
 
@@ -439,7 +439,7 @@ def restore_positions(f, w, t, q, v, tolerance, reuse_limit):
     """Solve C(t, q) = 0, eq. (15) of the paper, by Newton's method for the dependent positions in q; return a code.
 
     The iteration ends after a correction of at most `tolerance`. If this correction was larger than `reuse_limit`, the
-    Jacobian is then evaluated and factored again at the final q; otherwise w keeps those from before the correction.
+    Jacobian is evaluated and factored again at the final q; otherwise w keeps the Jacobian before the correction.
     The callback `kinematics`, if the user gave one, evaluates C, C_q and gamma (w.Gamma) together.
     """
     last_correction = np.inf
@@ -484,8 +484,8 @@ def restore_positions(f, w, t, q, v, tolerance, reuse_limit):
 def find_null_space(f, w, t, q):
     """Store in w.D how dependent velocities follow from independent ones, by the factors of the Jacobian w.G.
 
-    Row j of w.D: dependent velocities if independent velocity j is 1 and the others are 0, without drives. These rows
-    represent the null space of w.G. Last row: dependent velocities due to drives, if all independent ones are 0.
+    Row j of w.D contains the dependent velocities, without drives, if independent velocity j is 1 and the others are 0.
+    These rows span the null space of w.G. The last row: velocities due to drives if independent velocities are 0.
     """
     if f.kinematics_given == 0 or w.has_gamma == 0.0:
         constraint_rates(f, w, t, q, w.Rate)
@@ -532,8 +532,8 @@ def restore_velocities(f, w, t, q, v, reuse_limit):
 def check_all_rows(f, w, t, q, v):
     """Return DONE if the accepted state (q, v) satisfies all constraints, including redundant ones.
 
-    If one is violated by more than MAX_VIOLATION, store its index in w.contradiction; return ROWS_CONTRADICT. On entry,
-    w.G must contain the Jacobian of all constraints at this state, and w.Rate their rates (C_t, b).
+    If a constraint is violated by more than MAX_VIOLATION, store its index in w.contradiction; return ROWS_CONTRADICT.
+    On entry, w.G must contain the Jacobian of all constraints at this state, and w.Rate the rates (C_t, b).
     """
     w.C[:] = 0.0
     f.constraint(t, q, f.p, w.C)

@@ -7,7 +7,7 @@ with the forms of linalg/saddle_point.py, which methods with a partition always 
 entries of C_q; then no array has n_c times n_q numbers. They may also fill dense matrices; then entries are copied.
 
 If rows of G = C_q are redundant, many multipliers lam have the same reactions p = G^T lam. The shortest lam is used. It
-is G x for some x, and both solve
+equals G x for some vector x; x and lam solve
 
     [0  G^T] [ x ]   [p]
     [G  -1 ] [lam] = [0]
@@ -66,18 +66,18 @@ from twoloop.kernels.linalg.symbolic_factorization import (
 )
 
 # pivot / (squared norm of a row of C_q) is the squared sine of its angle to the span of previous rows, in metric M^-1
-SUSPECT_PIVOT = 1e-6  # up to this squared sine, the pivot may be a rounding error: check whether the row is redundant
+SUSPECT_PIVOT = 1e-6  # up to this squared sine of a row's angle, a pivot may be a rounding error: the row is checked
 MIN_PIVOT = 1e-10  # factors are accurate if pivot / (squared norm of the row) exceeds this for all independent rows
 MAX_DEPENDENT_SINE = 1e-11  # a row is redundant if the sine of its angle to the independent rows' span is at most this
 PROJECT_STAGES = 2.0  # value of w.nearly_singular near singular positions: stages are projected before evaluations
-# limits of the smallest pivot / (squared norm of its row of C_q): solutions are refined iteratively, once if it is at
-# most the first limit, and twice if it is at most the second
+# solutions are refined iteratively, once if the smallest pivot / (squared norm of its row of C_q) is at most the first
+# limit, and twice if this ratio is at most the second limit
 REFINE_ONCE_BELOW, REFINE_TWICE_BELOW = 1e-3, 1e-7
 
 
 @compiled
 def fill_mass_values(f, w, t, q):
-    """Store the entries of M(t, q) in w.mass_values. Do nothing if M is constant and dense: they are stored once."""
+    """Store the entries of M(t, q) in w.mass_values; do nothing if M is a constant full matrix, stored once before."""
     if f.mass_values_given == 1:
         w.mass_values[:] = 0.0
         f.mass_values(t, q, f.p, w.mass_values)
@@ -108,10 +108,10 @@ def fill_jacobian_values(f, w, t, q):
 
 @compiled
 def _factor_entries(f, w, min_sine_square):
-    """Factor [M G^T; G 0]; return the smallest sin^2 of the angle between a row of G and the span of previous rows.
+    """Factor [M G^T; G 0], G = C_q; return the smallest sin^2 of a row's angle to the span of previous rows of G.
 
-    Rows with a sin^2 up to `min_sine_square` are marked as redundant and left out, also from the returned minimum. If M
-    is not positive definite, return -1.
+    Rows of G with a sin^2 up to `min_sine_square` are marked as redundant and left out of the factors and the returned
+    minimum. If M is not positive definite, return -1.
     """
     w.n_factorizations += 1
     stiffness = w.solutions[3 * f.ldl_program[N_PIVOTS] :]
@@ -150,7 +150,7 @@ def factor_equations_at(f, w, t, q):
 
 @compiled
 def solve_unknowns(f, w, n_corrections):
-    """Solve [M G^T; G 0] x = b; x replaces b in w.unknowns. Refine x iteratively, `n_corrections` times."""
+    """Solve [M G^T; G 0] x = b, G = C_q: the solution x replaces b in w.unknowns. Refine x `n_corrections` times."""
     n = f.ldl_program[N_PIVOTS]
     scratch = w.solutions
     return solve_refined(
@@ -204,10 +204,10 @@ def _count_independent(is_independent):
 
 @compiled
 def _choose_rows(f, w, t, q):
-    """Set w.is_independent to 1 for independent rows of G, else to 0; factor [M G^T; G 0] with these; return a code.
+    """Set w.is_independent to 1 for independent rows of G = C_q, else to 0; factor [M G^T; G 0]; return a code.
 
-    First, leave out all rows with pivots up to SUSPECT_PIVOT. Then add each of them that is not a combination of the
-    rows chosen so far.
+    The factors contain the independent rows only. First, leave out all rows with pivots up to SUSPECT_PIVOT. Then add
+    each row that was left out, unless it is a combination of the rows chosen so far.
     """
     w.is_independent[:] = 1.0
     if not _factor_entries(f, w, SUSPECT_PIVOT) > 0.0:
@@ -244,7 +244,7 @@ def _adopt_rows(w):
 
 @compiled
 def choose_rows(f, w, t, q):
-    """Choose and store independent rows at (t, q); return a code: RANK_DIFFERS if w is allocated for another number."""
+    """Choose the independent rows of C_q at (t, q); return a code: RANK_DIFFERS if w has space for another number."""
     w.n_partitions += 1
     fill_mass_values(f, w, t, q)
     fill_jacobian_values(f, w, t, q)
@@ -259,11 +259,11 @@ def choose_rows(f, w, t, q):
     return _adopt_rows(w)
 
 
-# the diagonal matrix W of the module docstring makes a system regular; its entry j is this fraction of the sum of
-# squares of column j of C_q
+# entry j of the diagonal matrix W, which makes the equations in the module docstring regular, is this fraction of the
+# sum of squares of column j of C_q
 REGULARIZATION = 1e-11
-CONVERGED_RESIDUAL = 1e-14  # multipliers are refined until reactions agree with the given ones up to this fraction
-MAX_RESIDUAL = 1e-9  # if refinements help no more, multipliers are accepted if reactions agree up to this fraction
+CONVERGED_RESIDUAL = 1e-14  # multipliers are refined until the error of reactions is this fraction of the largest one
+MAX_RESIDUAL = 1e-9  # if refinements help no more, the error of reactions may be this fraction of the largest reaction
 MAX_SOLUTIONS = 30  # largest number of refinements of the multipliers of least norm
 
 
@@ -293,9 +293,9 @@ def _fill_least_norm_matrix(program, jacobian, n_q, weights, values):
 
 @compiled
 def _fill_residual(program, jacobian, force, x, r):
-    """Store in r the residual of the equations of the module docstring; return max|p - G^T lam| / max|p|.
+    """Store in r the residual of equations in the module docstring, [p - G^T lam, lam - G y]; return its relative size.
 
-    The residual is [p - G^T lam, lam - G y]. The argument x contains the approximate solution, first y, then the
+    The relative size is max|p - G^T lam| / max|p|. The argument x contains the approximate solution: the vector y, then
     multipliers lam. p (`force`): the reactions that lam must have; `jacobian`: entries of the constraint Jacobian G.
     """
     n_q, largest, residual = force.size, 0.0, 0.0
@@ -469,8 +469,8 @@ def _project_state(f, w, t, q, v, tolerance):
         is_last = is_last or correction_q <= w.pivot * tolerance
         if not is_last and correction_q > CONTRACTION * last_correction:
             limit = ROUNDING_OF_CORRECTIONS * largest_of(q)
-            # corrections do not become smaller: succeed only if this one may be due to rounding. It is not applied,
-            # because its rounding errors would move light bodies much more than heavy ones
+            # corrections do not become smaller: succeed only if the present one may be due to rounding. It is then not
+            # applied, because rounding errors would move light bodies much more than heavy ones
             return (
                 DONE
                 if correction_q <= limit or (correction_q <= AMPLIFICATION * limit and _is_on_constraints(f, w, q))
@@ -506,7 +506,7 @@ def _check_redundant_rows(f, w, t, q, v):
 
 @compiled
 def _do_task_between_evaluations(f, w, task, t, q, v, a, lam):
-    """Do a task other than evaluations and projections; return its code, or NEEDS_DENSE if only dense forms do it."""
+    """Do a task that neither evaluates nor projects; return a code: NEEDS_DENSE if only dense forms have this task."""
     if task == tasks.FIND_NULL_SPACE:
         return factor_equations_at(f, w, t, q)
     if task == tasks.RENEW_PARTITION:
@@ -525,7 +525,7 @@ def _do_task_between_evaluations(f, w, task, t, q, v, a, lam):
 def sparse_inner_loop(f, w, task, t, q, v, tolerance, a, lam):
     """Do a `task` (see tasks.py) at the state (q, v) by sparse factors; return a code.
 
-    The task SOLVE solves M a + G^T lam = r and G a = c (G: constraint Jacobian); then q contains r, and v contains c.
+    The task SOLVE solves M a + G^T lam = r and G a = c (G: constraint Jacobian); its arguments q and v contain r and c.
     """
     if task in (tasks.EVALUATE, tasks.EVALUATE_WITHOUT_PROJECTION):
         code = STOPPED if w.time_is_up == 1.0 else DONE
@@ -547,5 +547,5 @@ def sparse_inner_loop(f, w, task, t, q, v, tolerance, a, lam):
     if code != DONE:
         return code
     code = _compute_multipliers(f, w, lam)
-    # if w.M has nonzero entries that the elimination program does not read, the accelerations are wrong: NEEDS_DENSE
+    # accelerations are wrong if w.M has nonzero entries that the elimination program does not read
     return code if w.M.size == 0 or not has_new_entries(w.M, w.mass_pattern) else NEEDS_DENSE

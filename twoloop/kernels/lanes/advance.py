@@ -55,7 +55,7 @@ def _refill_lanes(code, order, control, work, n, n_rows, numbers, q0, v0, next_r
 
 @compiled
 def _write_states_in_steps(code, settings, control, options, work, n, new, times, out_q, out_v, status, n_steps):
-    """In lanes with an accepted step, store the states at output times within it, or NaN if their projection fails."""
+    """In lanes with an accepted step, store the states at output times within the step: NaN if a projection fails."""
     while True:
         n_requested = 0
         for k in range(LANES):
@@ -98,7 +98,7 @@ def _write_final_states(work, control, n, n_rows, new, a, last, out_q, out_v, ou
 
 @compiled
 def _count_evaluations(settings, work, n_evaluations):
-    """Add the number of evaluations in each lane's last step to `n_evaluations` (n_runs), at the index of its run."""
+    """Add the number of evaluations in the last step of each lane to n_evaluations[index of the run in the lane]."""
     for k in range(LANES):
         if work[at.RUNNING * LANES + k] == 1.0:
             n_within = settings[at.N_EVALUATIONS] + int(work[at.EVALUATED * LANES + k])

@@ -22,10 +22,10 @@ from twoloop.kernels.lanes.layout import (
     remove_run,
 )
 
-# indices in `options`, a vector that contains the N_RULE numbers of the step-size rule, then the following numbers, and
-# from index N_HEAD on the options of the method
+# indices in `options`, after the N_RULE numbers of the step-size rule. From N_HEAD on, `options` contains the method's
 # - JUMP_RATIO: assumed largest ratio of true error to error estimate in a step in which a force jumps
-# - FIRST: first step size, relative to the shortest time scale at the start; LEAST: smallest tolerance of a coordinate
+# - FIRST: first step size, relative to the shortest time scale of the motion at the start
+# - LEAST: the smaller one of the tolerances rtol and atol
 JUMP_RATIO, FIRST, LEAST, N_HEAD = range(N_RULE, N_RULE + 4)
 
 SUDDEN_ERROR = 10.0  # a rejected step with a larger error, in tolerances, is assumed to contain a jump of a force
@@ -129,11 +129,11 @@ def set_end(work, control):
 
 @compiled
 def end_steps(code, settings, control, work, predicted_v):
-    """Project NEW, the state at the end of the step, onto the constraints; raise ERROR to the changes that this causes.
+    """Project NEW, the state at the end of the step, onto the constraints; raise ERROR, the error estimate of the step.
 
-    ERROR is the error estimate of the step. It becomes the largest of three numbers: ERROR, the largest change of a
-    velocity in tolerances, and PREDICTION_ERROR, for positions. So a step is rejected if a drive has a jump or
-    kink between its stages, which its estimate does not show. `predicted_v`: offset of scratch.
+    The projection shows two more errors: the largest change of a velocity, in tolerances, and PREDICTION_ERROR, which
+    measures the change of positions. ERROR becomes the largest of the three numbers. So a step is rejected if a drive
+    has a jump or kink between stages, which the method's estimate does not show. `predicted_v`: offset of scratch.
     """
     n, order = settings[at.N], settings[at.ORDER]
     state, new, predicted, _, _, _, _, _ = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])
@@ -183,9 +183,9 @@ def _accept_or_shorten(options, work, k):
 
 @compiled
 def judge_steps(options, work, n, a, start, status):
-    """Set ACCEPTED to 1 in lanes whose step succeeded with a small error; there, copy accelerations `a` to `start`.
+    """Set ACCEPTED to 1 in lanes whose step succeeded with a small error; copy accelerations in these lanes to `start`.
 
-    In other lanes, count the rejected steps; after too many, remove the run.
+    In other lanes, count the rejected steps; remove a run after more than MAX_REJECTED. `a`, `start`: offsets.
     """
     for k in range(LANES):
         work[at.ACCEPTED * LANES + k] = 0.0

@@ -16,12 +16,12 @@ from twoloop.kernels.compile.generated_functions import GeneratedFunctions, has_
 from twoloop.kernels.compile.reference import Reference
 from twoloop.kernels.data.common import INTEGERS, compiled, inlined, merged
 
-UNDECIDED, ENDED = 0, 1  # status of a run: not ended yet; ended at t1
+UNDECIDED, ENDED = 0, 1  # status of a run: UNDECIDED if it has not ended yet, ENDED if it has reached its end t1
 # negative status: why a run has to be repeated outside the lanes
 (
     NO_START,  # the generated code could not compute the accelerations at the start
     NO_STATE,  # a state at an output time could not be projected
-    NO_VALUES,  # accelerations in a step are not finite, or the generated code is not valid there
+    NO_VALUES,  # accelerations are not finite, or the generated code is not valid, at a state in a step
     MANY_REJECTIONS,  # too many successive steps were rejected
     MANY_STEPS,  # the run takes too many steps
     CALLBACKS_DIFFER,  # the final state does not satisfy the equations as the user's callbacks evaluate them
@@ -60,7 +60,7 @@ LANES = 8 if has_wide_vectors() else 4  # number of runs at once: the number of 
     JUMP_END,  # time (s) at the end of the last step that was rejected with an error above SUDDEN_ERROR
     SHIFT,  # number from 0 to 1 that shifts the times of evaluations of the defect within a step
     EVALUATED,  # number of evaluations within the step, in addition to settings[N_EVALUATIONS]
-    DISPLACED,  # smallest size for displacements in finite differences, see `typical_size`
+    DISPLACED,  # size that smaller coordinates count as, when finite differences displace them, see `typical_size`
     PAST,  # size and error of the last accepted step, for step-size control: both of lane 0, then both of lane 1, ...
     _MORE_PAST,
     N_FIELDS,
@@ -83,8 +83,8 @@ STEP = types.void(CODE, INTEGERS, *[VECTOR] * 3, *[INTEGERS] * 2, types.boolean)
 CODE.add_function("step", STEP)
 
 # offsets in the memory of an explicit method, in units of n vectors (n: number of coordinates). START: accelerations at
-# the beginning of the next step; BEGIN, _BEGIN_V: q and v at the beginning of this step; PREDICTED_V: velocities at its
-# end before the projection; SLOPES: accelerations at the stages
+# the beginning of the next step; BEGIN, _BEGIN_V: q and v at the beginning of this step; PREDICTED_V: velocities at the
+# end of this step before the projection; SLOPES: accelerations at the stages
 START, BEGIN, _BEGIN_V, PREDICTED_V, SLOPES = range(5)
 
 # indices in `settings`, whole numbers that describe the mechanism and the method
@@ -96,7 +96,7 @@ START, BEGIN, _BEGIN_V, PREDICTED_V, SLOPES = range(5)
     N_NUMBERS,  # number of coefficients that the generated code reads
     N_EVALUATIONS,  # number of evaluations of accelerations within a step
 ) = range(6)
-# indices in `control`: start, end (s), longest time (s) between evaluations, rtol, first of the n absolute tolerances
+# indices in `control`: start T0 and end T1 (s), longest time GAP (s) between evaluations, RTOL, first of n values ATOL
 T0, T1, GAP, RTOL, ATOL = range(5)
 
 SHORTEST = 1e-13  # smallest step size, relative to max(|t|, |t1|); if a step is shorter, the run leaves its lane
@@ -172,7 +172,7 @@ def copy_vectors(work, source, target, count):
 
 @merged
 def _add_product_in_four_lanes(work, t, p, q, sign):
-    """Add sign * work[p] * work[q] to work[t], and do the same for the three indices after t, p and q (other lanes)."""
+    """Add sign * work[p] * work[q] to work[t]; do the same for the next three lanes. Read all, then write, for SIMD."""
     t0, t1 = work[t] + sign * work[p] * work[q], work[t + 1] + sign * work[p + 1] * work[q + 1]
     t2, t3 = work[t + 2] + sign * work[p + 2] * work[q + 2], work[t + 3] + sign * work[p + 3] * work[q + 3]
     work[t], work[t + 1], work[t + 2], work[t + 3] = t0, t1, t2, t3
@@ -180,14 +180,14 @@ def _add_product_in_four_lanes(work, t, p, q, sign):
 
 @compiled
 def add_product(work, target, x, y, sign):
-    """In each lane, add sign * x * y to `target` (offsets); read four lanes before writing one, to allow SIMD."""
+    """In each lane, add sign * (number at offset x) * (number at offset y) to the number at offset `target`."""
     for k in range(0, LANES, 4):
         _add_product_in_four_lanes(work, target * LANES + k, x * LANES + k, y * LANES + k, sign)
 
 
 @merged
 def _raised_value(work, target, error, factor, before, after, atol, rtol):
-    """Return the new number at `target` in one lane, see `raise_to_ratio`; arguments up to `after` are indices."""
+    """Return max(work[target], error / tolerance) for one lane, see `raise_to_ratio`. `target` to `after`: indices."""
     allowed_error = atol + rtol * max(abs(work[before]), abs(work[after]))
     return max(work[target], abs(work[error]) * work[factor] / allowed_error)
 
@@ -209,9 +209,9 @@ def raise_to_ratio(work, target, error, factor, before, after, atol, rtol):
 
 @merged
 def _multiply_number(work, target, imaginary_target, x, imaginary):
-    """In each lane, multiply the number at offset `target` by that at offset x (real if `imaginary` is 0).
+    """In each lane, multiply the number at offset `target` by the number at offset x.
 
-    If `imaginary` > 0, both are complex, with imaginary parts at target + imaginary_target and x + imaginary.
+    If `imaginary` is 0, both are real. Otherwise the imaginary parts are at target + imaginary_target, x + imaginary.
     """
     for k in range(LANES):
         t, p = target * LANES + k, x * LANES + k
@@ -225,9 +225,10 @@ def _multiply_number(work, target, imaginary_target, x, imaginary):
 
 @merged
 def _subtract_product(work, target, x, y, imaginary, imaginary_y):
-    """In each lane, subtract x * y from `target`; the arguments are offsets of numbers (real if `imaginary` is 0).
+    """In each lane, subtract the product of the numbers at offsets x and y from the number at offset `target`.
 
-    If `imaginary` > 0, all three are complex. Imaginary parts: x + imaginary, y + imaginary_y, target + imaginary_y.
+    If `imaginary` is 0, the numbers are real. Otherwise the imaginary part of x is `imaginary` vectors after the real
+    part; the imaginary parts of y and `target` are `imaginary_y` vectors after the real parts.
     """
     add_product(work, target, x, y, -1.0)
     if imaginary > 0:
@@ -298,7 +299,7 @@ def factor_matrices(work, matrix, pivots, n, imaginary):
 def solve_systems(work, matrix, pivots, n, imaginary, x):
     """Replace a right-hand side x (n) in each lane by the solution, using the factors from `factor_matrices`.
 
-    If `imaginary` > 0, the system is complex. Imaginary parts: `imaginary` (matrix) or n vectors (x) after real parts.
+    If `imaginary` > 0, entries are complex: imaginary parts are `imaginary` vectors (of x: n vectors) after real parts.
     """
     imaginary_x = n if imaginary > 0 else 0
     for c in range(n):

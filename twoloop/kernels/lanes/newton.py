@@ -48,8 +48,8 @@ from twoloop.kernels.steps.velocity_errors import LONGEST_GAPS, SLOW_FACTOR, STE
     ITERATING,  # 1 in lanes where Newton's iteration has not ended
     DONE,  # 1 in lanes where Newton's iteration has converged (not the status code of this name)
     CHANGE_BEFORE,  # largest correction by the previous iteration, relative to SCALE_Q and SCALE_V
-    SCALE_Q,  # largest absolute position at the stages, at least `smallest_size`
-    SCALE_V,  # largest absolute velocity at the stages, at least `smallest_size`
+    SCALE_Q,  # largest absolute position at the stages, at least the result of `_smallest_size`
+    SCALE_V,  # largest absolute velocity at the stages, at least the result of `_smallest_size`
     LARGEST_Q,  # largest correction of a stage's position by this iteration, divided by the square of the step size
     LARGEST_V,  # largest correction of a stage's velocity by this iteration, divided by the step size
     H_PREVIOUS,  # size (s) of the step whose accelerations are in PREVIOUS; 0: there is no such step
@@ -60,14 +60,14 @@ from twoloop.kernels.steps.velocity_errors import LONGEST_GAPS, SLOW_FACTOR, STE
 # indices of blocks of n vectors in the method's memory (n: number of coordinates)
 (
     START,  # accelerations at the beginning of the next step
-    BEGIN_Q,  # q at the beginning of this step; the next two blocks: v and a there
+    BEGIN_Q,  # q at the beginning of this step; the next two blocks contain v and a at the same time
     BEGIN_V,
     BEGIN_A,
     SUMS,  # scratch
-    MIDDLE_Q,  # q in the middle of the step; the next two blocks: v and a there
+    MIDDLE_Q,  # q in the middle of the step; the next two blocks contain v and a at the same time
     MIDDLE_V,
     MIDDLE_A,
-    E_Q,  # estimated error of q at the end of the step; the next block: of v
+    E_Q,  # estimated error of q at the end of the step; the next block contains the estimated error of v
     E_V,
     UNFILTERED,  # estimated error of v before filters
     FILTERED_ONCE,  # estimated error of v after one filter
@@ -76,8 +76,8 @@ from twoloop.kernels.steps.velocity_errors import LONGEST_GAPS, SLOW_FACTOR, STE
     N_VECTORS,
 ) = range(15)
 # indices of blocks of s n vectors (s stages, n coordinates) in the method's memory
-# - STAGES: accelerations at the stages of this step; PREVIOUS: those of the previous step
-# - RESIDUAL: residuals of Newton's method; CHANGES: its corrections of the accelerations
+# - STAGES: accelerations at the stages of this step; PREVIOUS: accelerations at the stages of the previous step
+# - RESIDUAL: residuals of Newton's method; CHANGES: corrections of the accelerations by Newton's method
 STAGES, PREVIOUS, RESIDUAL, CHANGES, N_BLOCKS = range(5)
 # indices of matrices (n, n) in the method's memory. DERIVATIVE_Q, DERIVATIVE_V: derivatives of the accelerations by q
 # and by v. From SYSTEMS on: for each linear system of Newton's method, the real and the imaginary part of its matrix
@@ -144,7 +144,7 @@ def _evaluate_middle_state(code, settings, control, c, work, new, a, memory):
 
 @merged
 def _smallest_size(control, n):
-    """Return `smallest_size` of the tolerances in `control`."""
+    """Return the smallest atol / rtol, at most 1: smaller coordinates and velocities count as this size."""
     size = 1.0
     if control[at.RTOL] > 0.0:
         for j in range(n):
@@ -154,7 +154,7 @@ def _smallest_size(control, n):
 
 @merged
 def _store_typical_size(control, work, n, vector):
-    """Store the smallest size for displacements of the `vector` q or v in DISPLACED, see `typical_size`."""
+    """Store in DISPLACED the size that smaller components of a vector (at offset `vector`) count as: `typical_size`."""
     least = _smallest_size(control, n)
     for k in range(LANES):
         size = least
@@ -219,11 +219,11 @@ def factor_systems_of_lanes(settings, method_options, s, work):
 
 @compiled
 def predict_stages(settings, c, work, begins):
-    """Store in STAGES a prediction of the stage accelerations: the polynomial through those in PREVIOUS.
+    """Predict the accelerations at the stages, STAGES: evaluate the polynomial through the accelerations in PREVIOUS.
 
     If X is larger than MAX_STEP_RATIO times the size of the step of PREVIOUS, the polynomial would be extrapolated too
-    far: then all predictions are the accelerations at the beginning of the step. `begins` is 1 if the stages belong to
-    the step after that of PREVIOUS, and 0 if they belong to the same step.
+    far: then all predictions are the accelerations at the beginning of the step. `begins`: 1 if STAGES belong to the
+    step after the step of PREVIOUS, 0 if STAGES belong to the same step.
     """
     n = settings[at.N]
     memory = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])[7]
@@ -255,7 +255,7 @@ def predict_stages(settings, c, work, begins):
 
 @compiled
 def _compute_residuals(code, settings, control, A, A2, c, work):
-    """Store in RESIDUAL accelerations by the equations minus STAGES; set SCALE_Q, SCALE_V; on failure, ACTIVE = 0."""
+    """Store accelerations by the equations minus STAGES in RESIDUAL; set SCALE_Q, SCALE_V; on failure, ACTIVE = 0."""
     n, order = settings[at.N], settings[at.ORDER]
     _, new, _, _, a, _, _, memory = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])
     s = c.size
@@ -329,7 +329,7 @@ def _raise_to_largest_value(work, target, begin, n):
 
 @compiled
 def _store_largest_corrections(settings, A, A2, work):
-    """Store in LARGEST_Q and LARGEST_V the largest changes of q, v due to CHANGES, divided by X^2 and X (A2 = A A)."""
+    """Store the largest changes of q and v due to CHANGES, divided by X^2 and X, in LARGEST_Q and LARGEST_V."""
     n = settings[at.N]
     memory = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])[7]
     s = A.shape[0]
@@ -400,7 +400,7 @@ def solve_stages(code, settings, control, options, method_options, A, A2, c, wor
 
 @compiled
 def store_state_from_stages(settings, b, bA, work):
-    """Store in NEW the state X s after the step's beginning; STAGES have weights b for v, and bA = b A for q."""
+    """Store in NEW the state X s after the step's beginning; the weights of STAGES are b for v, and bA = b A for q."""
     n = settings[at.N]
     _, new, _, _, _, _, _, memory = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])
     s = b.size
@@ -523,7 +523,7 @@ def _motion_time(control, work, n, memory, k):
 
 @compiled
 def _add_error_in_slow_directions(settings, control, method_options, s, work):
-    """Raise ERROR if the slowly changing part of the velocity error E_V causes a larger one; see velocity_errors.py."""
+    """Raise ERROR to the error that the slowly changing part of E_V causes, if it is larger; see velocity_errors.py."""
     n = settings[at.N]
     state, new, _, _, _, _, _, memory = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])
     e_v, error_field, fine_copy = vector_offset(memory, n, E_V), memory + LARGEST_V, memory + ITERATING

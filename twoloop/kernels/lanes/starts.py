@@ -20,15 +20,15 @@ from twoloop.kernels.lanes import layout as at
 from twoloop.kernels.lanes.layout import CODE, LANES, copy_vectors, fill_field, offsets_in_work
 
 DIAGONAL_SHIFT = 1e-15  # added to the diagonal of G G^T (G: Jacobian with rows of norm 1), so that it is not singular
-ITERATION_SHIFT = 1e-8  # replaces DIAGONAL_SHIFT in inverse iterations for redundant constraints: G G^T is singular
+ITERATION_SHIFT = 1e-8  # added to the diagonal of a singular G G^T, to find redundant constraints by inverse iterations
 MAX_REDUNDANT_EIGENVALUE = 1e-4  # up to this eigenvalue, an eigenvector of G G^T counts as a redundant constraint
 N_REDUNDANT_ITERATIONS = 5  # number of inverse iterations per redundant constraint; few suffice for tiny eigenvalues
-GOLDEN_SECTION = 0.6180339887498949  # inverse iterations start from irregular numbers: multiples of this one, modulo 1
+GOLDEN_SECTION = 0.6180339887498949  # multiples of this, modulo 1, are irregular numbers: start of inverse iterations
 
 
 @merged
 def _subtract_in_four_lanes(work, target, x, x_stride, y, y_stride, count):
-    """In four adjacent lanes, subtract `count` products work[x] * work[y] from work[target]; x, y grow by strides."""
+    """In four lanes, subtract `count` products work[x] * work[y] from work[target]; x and y grow by their strides."""
     t0, t1, t2, t3 = work[target], work[target + 1], work[target + 2], work[target + 3]
     for _ in range(count):
         t0 -= work[x] * work[y]
@@ -72,7 +72,7 @@ def _multiply_vector(work, target, factor):
 def _cholesky(work, pattern, n_rows, n_redundant, row, factors, shift):
     """Store the Cholesky factor of G G^T + shift I + Z^T Z in each lane, with inverted diagonal entries.
 
-    G, Z (combinations of rows of G that vanish) and the result are in `factors`. `row` (n): zero on entry and return.
+    `factors` contains G (Jacobian, rows of norm 1), Z (vanishing combinations of rows) and the result. `row` (n): zero.
     """
     n_entries = pattern[n_rows] - pattern[0]
     gram = factors + n_entries + n_rows
@@ -128,7 +128,7 @@ def factor_gram(work, pattern, moves, n_rows, n_redundant, G, row, factors):
 
 @compiled
 def _find_redundant_combinations(work, pattern, n_rows, n_redundant, row, factors):
-    """Store in `factors` Z, eigenvectors of G G^T for the n_redundant smallest eigenvalues; NaN if one is too large."""
+    """Store Z in `factors`: eigenvectors of G G^T for the n_redundant least eigenvalues, NaN for a large eigenvalue."""
     gram = factors + pattern[n_rows] - pattern[0] + n_rows
     Z = gram + n_rows * n_rows
     scratch = Z + n_redundant * n_rows
@@ -185,7 +185,7 @@ def _solve_with_gram(work, n_rows, factor, x):
 
 @compiled
 def solve_along_rows(work, pattern, n, n_rows, n_redundant, factors, x, out):
-    """Solve G G^T y = x; store -G^T y, the least d with G d = -x, in `out` (n); then replace x (n_rows) by y.
+    """Solve G G^T y = x; store -G^T y, the shortest d with G d = -x, in `out` (n); then replace x (n_rows) by y.
 
     G: Jacobian with rows scaled to norm 1. First, remove from x its components along vanishing combinations of rows.
     """
@@ -202,7 +202,7 @@ def solve_along_rows(work, pattern, n, n_rows, n_redundant, factors, x, out):
 
 @compiled
 def solve_least_change(work, pattern, n, n_rows, n_redundant, factors, x, change):
-    """Store in `change` (n) the least d with C_q d = -x (NaN in lanes where constraints are dependent); overwrite x."""
+    """Store in `change` (n) the shortest d with C_q d = -x (NaN in lanes with dependent constraints); overwrite x."""
     for i in range(n_rows):
         _multiply_vector(work, x + i, factors + pattern[n_rows] - pattern[0] + i)
     solve_along_rows(work, pattern, n, n_rows, n_redundant, factors, x, change)
@@ -210,7 +210,7 @@ def solve_least_change(work, pattern, n, n_rows, n_redundant, factors, x, change
 
 MAX_ITERATIONS = 12  # largest number of steps of the Gauss-Newton iteration
 ROUNDING_FACTOR = 64.0  # a constraint holds if its residual is at most this number of rounding errors of its terms
-# displaced positions are projected. Another assembly counts as near if a result differs from its linear prediction
+# displaced positions are projected. Another assembly counts as near if a projection differs from the linear prediction
 # (the displacement without its part normal to the constraints) by more than this part of the displacement
 MAX_CURVATURE = 0.25
 MIN_EIGENVALUE = 1e-12  # constraints are independent if all eigenvalues of G G^T exceed this (rows of G have norm 1)
@@ -520,9 +520,9 @@ def motion_residuals(f, sizes, t, rtol, atol, runs, parameters, states_q, states
 def constraint_residuals(f, sizes, t, min_speed, parameters, q, v, scratch, worst):
     """Store in worst[k] the largest relative residual of C = 0 and C_q v + C_t = 0 at the state (q[k], v[k]).
 
-    C_i is divided by s_i max|q_j|, where s_i is the sum of |entries| in row i of C_q; the residual of velocities, by
-    s_i max(max|v_j|, min_speed) + |C_t|: min_speed is for states at rest. parameters : (n_states, n_p); sizes : n, n_c
-    and the index in f.p of the first parameter; scratch : (n_c (n + 2),) overwritten.
+    C_i is divided by s_i max|q_j|, where s_i is the sum of |entries| in row i of C_q. The residual of velocities is
+    divided by s_i max(max|v_j|, min_speed) + |C_t|; min_speed is for states at rest. parameters : (n_states, n_p);
+    sizes : n, n_c and the index in f.p of the first parameter; scratch : (n_c (n + 2),) overwritten.
     """
     n, n_c, first = sizes[0], sizes[1], sizes[2]
     C, rate, G = scratch[:n_c], scratch[n_c : 2 * n_c], scratch[2 * n_c :].reshape((n_c, n))

@@ -1,7 +1,7 @@
 """Factor and solve banded matrices by LAPACK: the mass matrix, and Newton matrices with a border of constraints.
 
 In LAPACK's band storage, entry (i, j) of a matrix is entry [j, top + i - j] of a C-ordered array. For the upper
-triangle of the mass matrix M, top is the bandwidth b. For an LU, top is 2 b, because row exchanges fill b diagonals.
+triangle of the mass matrix M, top is the bandwidth b. For an LU, top is 2 b: row exchanges fill b more diagonals.
 
 The LAPACK library comes with SciPy. Kernels are stored on disk, but addresses of LAPACK routines differ from process to
 process, and must not be part of compiled code. So a run stores `lapack_addresses` in its workspace `w`, and passes one
@@ -76,7 +76,7 @@ def banded_pays(n_q: int, n_c: int, bandwidth: int) -> bool:
 
 @merged
 def has_banded_mass(f):
-    """Return True if the mass matrix is factored as a banded matrix; not if diagonal: divisions are faster then."""
+    """Return True if the mass matrix is factored as a banded matrix. A diagonal one is not: divisions are faster."""
     return f.bandwidth >= 0 and f.diagonal_mass == 0
 
 
@@ -96,7 +96,7 @@ def _mass_diagonals(w, b):
 
 @compiled
 def factor_banded_mass(f, w):
-    """Store the Cholesky factor and the diagonals of the mass matrix w.M in w.L; return DONE or MASS_NOT_DEFINITE."""
+    """Store in w.L the Cholesky factor of the mass matrix w.M, and a copy of the diagonals of w.M; return a code."""
     n = w.Q.size
     b = f.bandwidth
     band = _mass_band(w, b)
@@ -136,13 +136,13 @@ def add_banded_mass_times(f, w, x, y):
 
 
 # The bordered system [[B, Cq^T], [Cq, 0]] [x; mu] = [r; 0] occurs in Newton's method: B is a matrix of bandwidth b, and
-# Cq the constraint Jacobian. Its solution is mu = (Cq B^-1 Cq^T)^-1 Cq B^-1 r, x = B^-1 (r - Cq^T mu). The array
+# Cq the constraint Jacobian. The solution is mu = (Cq B^-1 Cq^T)^-1 Cq B^-1 r, x = B^-1 (r - Cq^T mu). The array
 # `numbers`, real or complex, contains the LU of B; the transpose of B^-1 Cq^T; the LU of Cq B^-1 Cq^T; scratch (n_c).
 
 
 @inlined
 def lu_band(numbers, n, b):
-    """Return the part of `numbers` for a matrix B of bandwidth b, then for its LU; entry (i, j) is [j, 2 b + i - j]."""
+    """Return the part of `numbers` for B (bandwidth b), later for the LU of B; entry (i, j) is at [j, 2 b + i - j]."""
     return numbers[: n * (3 * b + 1)].reshape((n, 3 * b + 1))
 
 
@@ -166,7 +166,7 @@ def _scratch_view(numbers, n, n_c, b):
 
 @compiled
 def factor_bordered(w, b, Cq, numbers, pivots, factorize, substitute):
-    """Factor [[B, Cq^T], [Cq, 0]], where `numbers` contains the banded matrix B; return DONE or SINGULAR.
+    """Factor [[B, Cq^T], [Cq, 0]] (Cq: constraint Jacobian); return DONE or SINGULAR. `numbers`: banded matrix B.
 
     `factorize`, `substitute`: indices of the LAPACK routines, DGBTRF and DGBTRS, or the complex ZGBTRF and ZGBTRS.
     """
@@ -191,7 +191,7 @@ def factor_bordered(w, b, Cq, numbers, pivots, factorize, substitute):
 
 @compiled
 def solve_bordered(w, b, Cq, numbers, pivots, substitute, x):
-    """Replace x = r by the solution x of [[B, Cq^T], [Cq, 0]] [x; mu] = [r; 0], by factors from `factor_bordered`."""
+    """Replace r, given as x, by the solution x of [[B, Cq^T], [Cq, 0]] [x; mu] = [r; 0]; see `factor_bordered`."""
     n_c, n = Cq.shape
     band, exchanges = lu_band(numbers, n, b), pivots[: n - n_c].view(np.int32)
     call_lapack(w.lapack[substitute], (NO_TRANSPOSE, n, b, b, 1, band, 3 * b + 1, exchanges, x, n))

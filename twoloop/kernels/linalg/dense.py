@@ -15,7 +15,7 @@ def copy(source, target):
 
 @merged
 def copy_matrix(source, target):
-    """Copy the matrix `source` to `target` row by row; if one has fewer rows, copy as many rows."""
+    """Copy the rows that both matrices have from `source` to `target`."""
     for i in range(min(source.shape[0], target.shape[0])):
         for j in range(source.shape[1]):
             target[i, j] = source[i, j]
@@ -186,7 +186,7 @@ def ldl_solve(A, x):
 
 @merged
 def ldl_solve_rows(A, B):
-    """Solve for all columns of B by operations on its rows; solutions replace B. A: factors from `ldl_factor`."""
+    """Replace each column of B, a right-hand side, by the solution, using the factors A from `ldl_factor`."""
     n, m = B.shape
     for k in range(n):
         for i in range(k + 1, n):

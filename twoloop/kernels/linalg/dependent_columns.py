@@ -6,14 +6,14 @@ the pivot is not the largest but the one that causes the least fill-in: so nearb
 
 from twoloop.kernels.data.common import INTEGERS, MATRIX, VECTOR, compiled, i8, kernel, merged
 
-# kinds of entries of the constraint Jacobian G: always zero; constant, not zero; varying with the position.
-# In this module, R contains the rows of G during the elimination, and K (same shape) the kinds of their entries.
+# kinds of entries of the constraint Jacobian G: NONE is always zero, NUMBER is constant, VARIES depends on positions.
+# In this module, R contains the rows of G during the elimination, and K (same shape) the kinds of the entries of R.
 # columns[i] lists the columns of the entries of row i whose kind is not NONE; row_sizes[i] is their number
 NONE, NUMBER, VARIES = 0, 1, 2
 ROWS_SEARCHED = 4  # to save time, pivot blocks are sought only in this number of rows, which have the fewest entries
-# limits for a pivot block: three pairs, tried in this order until a block meets both limits; later ones are looser
-# - MAX_SQUARES: the block's equations determine its coordinates from the others; this limits the sum of the squares of
-#   the coefficients of the others
+# limits for a pivot block: three pairs, from strict to loose, are tried until a block meets both limits of a pair
+# - MAX_SQUARES: a block's equations express its coordinates by other coordinates; this limits the sum of squares of the
+#   coefficients of the other coordinates
 # - MIN_SINE_SQUARES: smallest squared sine of the angle between the columns of two pivots; for a single pivot, smallest
 #   squared ratio of the pivot to the norm of its column of G
 # With the first pair, pivots stay large for 98 % of a turn of a spatial four-bar, with the second for 34 %. The last

@@ -111,7 +111,7 @@ def index_of_lower_begins(r):
 
 @merged
 def index_of_entries(r):
-    """Return the offset, in a program for r rows, of three lists: row, column and source of each entry of L and U."""
+    """Return where a program for r rows lists the rows, columns and indices of initial values of entries of L and U."""
     return N_HEAD + 6 * r + 1
 
 
