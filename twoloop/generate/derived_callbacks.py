@@ -20,14 +20,14 @@ from twoloop.generate.trace import GAMMA_SOURCES, Equations, Evaluator, TraceCac
 from twoloop.generate.traced_values import CallbackTraces, Check, accept_traces
 from twoloop.problem.system import ConstrainedSystem
 
-# keys: callbacks that are derived if the user does not give them; values: attribute of a system, their number of rows
+# keys: callbacks that are derived if the user does not give them; values: attribute of a system with their size
 DERIVABLE_CALLBACKS = {"jacobian": "n_c", "gamma": "n_c", "nonholonomic_gamma": "n_a"}
 
 
 class DerivedPrograms:
     """Programs that replace missing callbacks, shared by all systems whose callbacks have the same traces.
 
-    programs : keys: kinds of callbacks; values: a program, and indices of its results in the flattened callback array.
+    programs : for each replaced callback, its program, and the indices of the results in the array of the callback.
     traced : the traces that the programs were derived from.
     """
 
@@ -35,7 +35,7 @@ class DerivedPrograms:
         self.programs, self.traced, self.kinds = programs, traced, traced.kinds
 
     def specialize(self, system: ConstrainedSystem, evaluate: Evaluator) -> "DerivedSystem":
-        """Return `system` with these programs as missing callbacks; `evaluate` computes coefficients of programs."""
+        """Return a copy of `system` with these programs as callbacks; `evaluate` computes their coefficients."""
         functions: dict[str, Any] = {}
         for name, (program, indices) in self.programs.items():
             vectors = program.replace_coefficients(evaluate).as_arrays(indices)
@@ -46,22 +46,22 @@ class DerivedPrograms:
 
 
 class DerivedSystem(NamedTuple):
-    """Pair: a system with programs for missing callbacks, and the traces that the programs were derived from."""
+    """System with programs in place of missing callbacks, and the traces that the programs were derived from."""
 
     system: ConstrainedSystem
     traced: CallbackTraces
 
     @property
     def kinds(self) -> frozenset[str]:
-        """Return the kinds of callbacks that were traced."""
+        """Return the names of the callbacks that were traced, such as "mass"."""
         return self.traced.kinds
 
 
 def derive_callbacks(system: ConstrainedSystem, check: Check) -> tuple[ConstrainedSystem, tuple[CallbackTraces, ...]]:
-    """Return a system with programs in place of missing callbacks for C_q and gamma, and the traces used for them.
+    """Return a system with programs in place of missing callbacks for C_q and gamma, and the traces of the programs.
 
-    If no callback is missing, or callbacks cannot be traced, return `system` itself and an empty tuple: finite
-    differences then replace missing callbacks. `check` raises Untraceable if the traces are wrong.
+    If no callback is missing, or callbacks cannot be traced, return `system` itself and an empty tuple. In the second
+    case, finite differences replace missing callbacks. `check` raises Untraceable if the traces are wrong.
     """
     missing = [kind for kind, size in DERIVABLE_CALLBACKS.items() if getattr(system, size) and kind not in system.given]
     if not missing:
@@ -87,7 +87,7 @@ def _derive_programs(system: ConstrainedSystem, missing: Sequence[str], cache: T
 
 
 def _missing_derivatives(equations: Equations, missing: Sequence[str]) -> dict[str, dict[int, Affine]]:
-    """Return expressions for "jacobian" (nonzero entries of C_q, flattened) and "gamma" (all rows of C, then of A)."""
+    """Return expressions by index: "gamma" (rows of C, then of A), and "jacobian" (nonzero entries of flat C_q)."""
     system = equations.system
     gamma: dict[int, Affine] = {}
     for kind, first in (("gamma", 0), ("nonholonomic_gamma", system.n_c)):
@@ -102,14 +102,15 @@ def _missing_derivatives(equations: Equations, missing: Sequence[str]) -> dict[s
 Array = NDArray[np.float64]
 
 MAX_ENTRIES = 50_000  # callbacks are not compared with exact derivatives if G = [C_q; A] has more entries
-# callbacks are compared with derivatives at the start plus these multiples of the sizes of q, and of a time scale
+# callbacks and exact derivatives are compared at the start, and at states displaced from the start: coordinates by
+# these multiples of their sizes, the time by these multiples of FIRST_TIME_SCALE
 DISPLACEMENTS = (0.0, 1e-3, 0.03)
 
 
 def exact_derivatives(system: ConstrainedSystem, check: Check = accept_traces) -> CallbackTraces | None:
     """Return the exact derivatives C_q, C_t and gamma as traces, to be compared with callbacks.
 
-    Return None if there are more than MAX_ENTRIES entries, callbacks cannot be traced, or `check` rejects the traces.
+    Return None if G has more than MAX_ENTRIES entries, callbacks cannot be traced, or `check` rejects the traces.
     """
     if system.n_q * (system.n_c + system.n_a) > MAX_ENTRIES:
         return None
@@ -124,7 +125,7 @@ def _trace_derivatives(system: ConstrainedSystem, cache: TraceCache) -> Callback
     equations = cache.equations(system)
     callbacks = [kind for kind in ("jacobian", *GAMMA_SOURCES) if kind in system.given]
     exprs = {kind: equations.derivatives(kind) for kind in (*callbacks, *(["constraint_rate"] if system.n_c else []))}
-    # also compare the callbacks that were differentiated with their traces: only then are the derivatives correct
+    # derivatives of a wrong trace are wrong: so also compare the callbacks that were differentiated with their traces
     exprs |= {kind: equations.expressions(kind) for kind in ("constraint", "nonholonomic", "nonholonomic_rate")}
     return CallbackTraces(system, equations.graph, exprs)
 
@@ -132,8 +133,8 @@ def _trace_derivatives(system: ConstrainedSystem, cache: TraceCache) -> Callback
 def has_exact_derivatives(system: ConstrainedSystem, t: float, q: Array, v: Array) -> bool:
     """Return True if callbacks for C_q, C_t and gamma agree with exact derivatives at states near a start (t, q, v).
 
-    If they differ, or callbacks cannot be traced, return False. Raise ValueError if C depends on time, perhaps only far
-    from the start, but there is no callback for C_t.
+    If values differ, or callbacks cannot be traced, return False. Raise ValueError if the constraints C depend on time,
+    perhaps only far from the start, but there is no callback for C_t.
     """
     direction = generic_factors(len(q)) * sizes(q)
     states = [(t + displacement * FIRST_TIME_SCALE, q + displacement * direction) for displacement in DISPLACEMENTS]
@@ -157,7 +158,7 @@ def has_exact_derivatives(system: ConstrainedSystem, t: float, q: Array, v: Arra
 
 
 def generic_states(states: Sequence[tuple[float, Array, Array]]) -> Array:
-    """Return rows [t, q, v] with t and q of `states`, and random velocities, about as large as given v or larger."""
+    """Return rows [t, q, v]: t and q of `states`; random velocities, about as large as those of `states` or larger."""
     times, positions, velocities = (np.array(values, dtype=float) for values in zip(*states, strict=True))
     generic_v = np.array([sizes(q) for q in positions]) * _random_factors(*positions.shape)
     scale = max(1.0, float(np.abs(velocities).max()) / float(np.abs(generic_v).max()))

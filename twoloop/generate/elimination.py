@@ -9,8 +9,8 @@ with G = [C_q; A] (A: non-holonomic rows) is eliminated in an order that is chos
 are skipped. A row of G comes after the coordinates in which it has entries. So the pivots are those of the definite
 matrices M and -G M^-1 G^T: none is zero.
 
-- If a row of G has a much smaller pivot than it would have without the other rows, it nearly depends on these rows, and
-  the generated code reports that its results are invalid.
+- If a row of G has a much smaller pivot than it would have without the other rows, this row nearly depends on the other
+  rows, and the generated code reports that its results are invalid.
 - The same factors are used to compute the nearest position and velocity on the constraints, in the metric of M.
 - If M is singular, terms s g^T g are added to it: g are rows of G, and s is the scale of a row. In short, "rows are
   added to M". This changes neither accelerations nor projections.
@@ -47,27 +47,27 @@ from twoloop.problem.system import ConstrainedSystem
 Array = NDArray[np.float64]
 
 SINGULAR_MASS = 1e-10  # M is singular if its smallest eigenvalue is below this fraction of its largest eigenvalue
-RANK_TOL = 1e-9  # a row of G depends on others if the norm of its part orthogonal to them is below this * its norm
-# relative pivot of a row of G: its pivot / the pivot that it would have if G had no other rows. Generated code accepts
-# relative pivots down to a lower limit, which is about this fraction of the smallest one at the start
+RANK_TOL = 1e-9  # a row g of G depends on others if the norm of its part orthogonal to them is below this * norm of g
+# the relative pivot of a row of G is its pivot / the pivot that the row would have if G had no other rows. Generated
+# code is invalid below a limit of relative pivots: about this fraction of the smallest relative pivot at the start
 PIVOT_FRACTION = 0.01
-MIN_PIVOTS = 10.0 ** np.arange(-2, -9, -1)  # possible lower limits; at smaller pivots, rounding errors dominate
-# the limit is MIN_PIVOTS[i] for the first i with START_LIMITS[i] <= smallest relative pivot at the start; if no i has
-# this property, it is MIN_PIVOTS[-1]
+MIN_PIVOTS = 10.0 ** np.arange(-2, -9, -1)  # possible limits of relative pivots; below these, rounding errors dominate
+# let p be the smallest relative pivot at the start. The limit of relative pivots during the run is MIN_PIVOTS[i] for
+# the first i with START_LIMITS[i] <= p; if there is no such i, the limit is MIN_PIVOTS[-1]
 START_LIMITS = MIN_PIVOTS[:-1] / PIVOT_FRACTION
-# M + s G^T G (s: scales) replaces M on trial if the lower limit of relative pivots is MIN_PIVOTS[i], with i at least
-# - MIN_INDEX_FEW, for at most N_FEW_COORDINATES coordinates
-# - MIN_INDEX_FEW_SINGULAR, if M is also singular: Euler parameters lose two digits even in sound models
-# - MIN_INDEX_MANY (plus one if M is singular), for more coordinates, because the code gets longer
+# M + s G^T G (s: scales of rows) replaces M on trial if the limit of relative pivots is as small as MIN_PIVOTS[i] with
+# i >= MIN_INDEX_FEW. This rule is for at most N_FEW_COORDINATES coordinates; if M is singular, MIN_INDEX_FEW_SINGULAR
+# replaces MIN_INDEX_FEW, as Euler parameters lose two digits even in sound models. For more coordinates, the code gets
+# longer, and i must be at least MIN_INDEX_MANY, or MIN_INDEX_MANY + 1 if M is singular
 N_FEW_COORDINATES = 24
 MIN_INDEX_FEW, MIN_INDEX_FEW_SINGULAR, MIN_INDEX_MANY = 4, 5, 6
 ADDED_SIZE = 16.0  # if s G^T G is added to M, its largest entry is about this many times the largest entry of M
-MAX_PIVOT_RATIO = 1e5  # solutions are refined if a diagonal entry of M with added rows is larger than this * its pivot
-SCALE_STEP = 1024.0  # scales of rows differ by powers of this number; as it is large, most starts have the same code
+MAX_PIVOT_RATIO = 1e5  # solutions are refined if a diagonal entry of M with added rows is above this * the row's pivot
+SCALE_STEP = 1024.0  # scales of rows added to M differ by powers of this number, so large that most starts share code
 DISPLACEMENT = 0.2  # displacement of coordinates (m or rad) to a position where no entry of M and G is zero by chance
-MIN_GAIN = 2  # M + s G^T G replaces M if the lower limit of relative pivots rises by at least this many powers of ten
+MIN_GAIN = 2  # M + s G^T G replaces M if the limit of relative pivots rises by at least this many powers of ten
 # dependent coordinates are eliminated (null_space.py) only if there are at least this many constraints per coordinate:
-# otherwise the linear system for the multipliers is smaller
+# with fewer, the linear system for the multipliers is smaller than the one for the independent accelerations
 MIN_ROW_RATIO = 2.0 / 3.0
 
 PivotBlocks = tuple[tuple[tuple[int, ...], tuple[int, ...]], ...]
@@ -114,7 +114,7 @@ class DependentColumns:
 
     rows : indices of the independent rows of G.
     choose (field) : compiled function choose(G, *arguments), which stores pivot blocks and returns their number. None:
-        no coordinates are eliminated, as G has too few rows, or it is unknown which entries are constant.
+        no coordinates are eliminated, as G has too few rows, or it is unknown which entries of G are constant.
     """
 
     choose: Any = None
@@ -152,13 +152,13 @@ def _entry_kinds(system: ConstrainedSystem) -> Any:
 
     cache = shared_cache(system)
     kinds = cache.remembered("kinds of entries", partial(find_kinds, partial(cache.equations, system)))
-    if kinds is None:  # perhaps a callback branches on parameters: trace it with those of this system
+    if kinds is None:  # perhaps a callback branches on parameters: trace it with the numbers of this system
         kinds = system.remembered("kinds of entries", partial(find_kinds, partial(Equations, system)))
     return kinds
 
 
 class PivotChooser:
-    """Compiled search, with its scratch arrays, for the rows and pivots of the elimination at positions of a system."""
+    """Compiled search for the rows and pivots of the elimination, given the numbers of M and G at a position."""
 
     def __init__(self, system: ConstrainedSystem):
         from twoloop.kernels.linalg.rank import choose_rows, workspace_size
@@ -172,7 +172,7 @@ class PivotChooser:
         self._last_key, self._last_choice = (0, b"", 0.0), PivotChoice((), (), (), 0.0)
 
     def choose(self, mass: Array, G: Array, nearby: Callable[[], tuple[Array, Array]]) -> PivotChoice:
-        """Return the PivotChoice, without blocks, for M (n_q, n_q) and G (n_c + n_a, n_q).
+        """Return the PivotChoice for the numbers of M and G at a position; its pivot blocks are not chosen yet.
 
         `nearby` returns M and G at another position, where no entry is zero by chance. Raise Untraceable if M is
         singular on velocities that the constraints allow.
@@ -199,7 +199,7 @@ class PivotChooser:
         return choice
 
     def _min_pivot_index(self, choice: PivotChoice, scales: Sequence[float], mass: Array, G: Array) -> int:
-        """Return the index of the smallest allowed pivot in MIN_PIVOTS if `choice.added_rows` are added to M, scaled.
+        """Return the index, in MIN_PIVOTS, of the limit of relative pivots if `choice.added_rows` are added to M.
 
         Return -1 if M with added rows is not positive definite, or if the independent rows differ from `choice.rows`.
         """
@@ -214,8 +214,8 @@ class PivotChooser:
 
         A body may have little inertia about its joints, such as a rod with a mass in its middle. Then rows of G are
         nearly dependent in the metric of M, and a smallest pivot of 10^-k costs up to 2 k digits of accelerations. In
-        the metric of M + s G^T G, they are not. If s G^T G is 10^k times as large as M, k digits are lost, and
-        refinement restores them. `factors` multiply the scales s; `index`: choice.min_pivot is MIN_PIVOTS[index].
+        the metric of M + s G^T G, the rows are independent. If s G^T G is 10^k times as large as M, k digits are lost,
+        and refinement restores them. `factors` multiply the scales s; choice.min_pivot is MIN_PIVOTS[index].
         """
         rows = G[list(choice.rows)]
         scale = 2.0 ** np.round(np.log2(ADDED_SIZE * np.abs(mass).max() / np.abs(rows).max() ** 2))
@@ -245,7 +245,7 @@ class PivotChooser:
 
 
 def _nearby(system: ConstrainedSystem, t: float, q: Array) -> tuple[Array, Array]:
-    """Return M and G at a displaced position, or at q if callbacks are not defined there."""
+    """Return M and G at a position displaced from q, or at q if callbacks are undefined at the displaced one."""
     try:
         return mass_and_rows(system, t, q + DISPLACEMENT * np.cos(np.arange(len(q))))
     except Exception:
@@ -253,12 +253,12 @@ def _nearby(system: ConstrainedSystem, t: float, q: Array) -> tuple[Array, Array
 
 
 def _scale_factors(singular: Sequence[int], mass: Array, G: Array) -> Array:
-    """Return a factor for each row g of G: if s g^T g is added to M, s is multiplied by it.
+    """Return for each row g of G a factor, by which the scale s is multiplied if s g^T g is added to M.
 
     Without the factor, a row on Euler parameters alone, such as their norm, would hide the small inertia of a body
     beside heavy bodies. `singular`: rows that are added because M is singular. The factor is a negative power of
     SCALE_STEP if M is small in all columns in which g has nonzero entries, and the rows `singular` have nonzero entries
-    in all these columns, too. Otherwise it is 1.
+    in all these columns, too. Otherwise, the factor is 1.
     """
     rows, covered = np.abs(G), np.any(G[list(singular)], axis=0)
     has_entry = rows > 0.0
@@ -266,13 +266,13 @@ def _scale_factors(singular: Sequence[int], mass: Array, G: Array) -> Array:
     own /= np.maximum(rows.max(axis=1, initial=0.0), np.finfo(float).tiny) ** 2
     ratio = own / (np.abs(mass).max() / rows.max() ** 2)
     smaller = (ratio > 0.0) & ~rows[:, ~covered].any(axis=1)
-    # with 0.25 added, the factor is 1 for ratios down to SCALE_STEP ** -1.25, which cost no digits
+    # as 0.25 is added, the factor is 1 if `ratio` is above SCALE_STEP ** -1.25: such ratios cost no digits
     steps = np.ceil(np.log(np.where(smaller, ratio, 1.0)) / np.log(SCALE_STEP) + 0.25)
     return np.asarray(SCALE_STEP ** np.minimum(steps, 0.0))
 
 
 def _may_lose_digits(choice: PivotChoice, mass: Array, G: Array) -> bool:
-    """Return True if light bodies may lose digits: rows are added to M with several scales, or a pivot is small."""
+    """Return True if light bodies may lose digits: M has added rows, and a small pivot or rows of several scales."""
     if not choice.added_rows:
         return False
     added, scales = G[list(choice.added_rows)], np.array(choice.scales)
@@ -281,9 +281,9 @@ def _may_lose_digits(choice: PivotChoice, mass: Array, G: Array) -> bool:
     return len(set(choice.scales)) > 1 or ratio > MAX_PIVOT_RATIO
 
 
-MAX_OPERATIONS = 60_000  # no code is generated if the elimination takes more; 40 bodies in space need fewer
-# accelerations by elimination of dependent coordinates are compiled only if they cost less than this fraction of those
-# by the elimination that begins with M, which is always compiled. At 0.68 (four-bar), they save 5 % of a run's time
+MAX_OPERATIONS = 60_000  # no code is generated if the elimination takes more operations; 40 bodies in space need fewer
+# the elimination of dependent coordinates is compiled only if its cost is below this fraction of the cost of the
+# elimination that begins with M, which is always compiled. At a fraction of 0.68 (four-bar), it saves 5 % of a run
 MAX_COST_RATIO = 0.75
 
 
@@ -308,7 +308,7 @@ class Elimination:
     def __init__(self, system: ConstrainedSystem, choice: PivotChoice, equations: Equations | None = None):
         self.equations = Equations(system) if equations is None else equations
         self.system, self.choice, self.graph = system, choice, self.equations.graph
-        self.zero, self._n_reduced = Affine(self.graph, 0.0, {}), 0  # _n_reduced: operations of `reduced_program`
+        self.zero, self._n_reduced = Affine(self.graph, 0.0, {}), 0  # _n_reduced: operations only for `reduced_program`
         n, (self.q, self.v) = system.n_q, (self.equations.q, self.equations.v)
         self.mass = self._callback_terms("mass")
         rows = [self._callback_terms("jacobian"), self._callback_terms("nonholonomic")]
@@ -347,7 +347,7 @@ class Elimination:
         return Program(self.graph, {"": []}, conditions)
 
     def _matrix(self) -> dict[tuple[int, int], Affine]:
-        """Return the nonzero entries of [M G^T; G 0]. G has only the independent rows; M includes added rows."""
+        """Return the nonzero entries of [M G^T; G 0]. G has only the independent rows; M includes added terms."""
         n = self.system.n_q
         matrix = {(i, j): self.mass[i, j] for i in range(n) for j in range(n) if not is_zero(self.mass[i, j])}
         for i, j in matrix:
@@ -369,11 +369,11 @@ class Elimination:
         return matrix
 
     def _solve(self, r: Sequence[Affine], c: Sequence[Affine]) -> tuple[list[Affine], list[tuple[Affine, Affine]]]:
-        """Return [a, lam] that solve M a + G^T lam = r, G a = c, and conditions for it; c has entries for all rows."""
+        """Return the solution [a, lam] of M a + G^T lam = r, G a = c (c: for all rows of G), and its conditions."""
         return solve_refined(self.factors.solve, self.choice, self.mass, self.all_rows, r, c)
 
     def _right_sides(self, v: Sequence[Affine]) -> tuple[list[Affine], list[Affine]]:
-        """Return Q (n_q,), and the right-hand sides (n_c + n_a,) of all rows of G a = gamma, at velocities v."""
+        """Return the forces Q (n_q,), and the right-hand sides c (n_c + n_a,) of G a = c, at velocities v."""
         return list(self._callback_terms("force", v)), [
             *self._callback_terms("gamma", v),
             *self._callback_terms("nonholonomic_gamma", v),
@@ -388,7 +388,7 @@ class Elimination:
 
     @cached_property
     def reduced_program(self) -> Program | None:
-        """Return a shorter program for "a" that eliminates dependent coordinates; None if it would save too little."""
+        """Return a shorter program for accelerations, which eliminates dependent coordinates; None: too little gain."""
         blocks = self.choice.blocks
         if not blocks:
             return None
@@ -414,13 +414,13 @@ class Elimination:
 
     @cached_property
     def right_sides(self) -> Program:
-        """Return the program for "r" = Q and "c", right-hand sides of G a = c; 0 for redundant rows not added to M."""
+        """Return the program for forces "r", and "c" of G a = c; c is 0 in redundant rows that are not added to M."""
         force, gamma = self._right_sides(self.v)
         used = {*self.choice.rows, *self.choice.added_rows}
         return Program(self.graph, {"r": force, "c": [x if k in used else self.zero for k, x in enumerate(gamma)]})
 
     def _accelerations(self, v: Sequence[Affine]) -> tuple[list[Affine], list[tuple[Affine, Affine]]]:
-        """Return accelerations at velocities v and multipliers of independent rows in one list; conditions for them."""
+        """Return [accelerations at velocities v, multipliers of independent rows], and conditions for these results."""
         return self._solve(*self._right_sides(v))
 
     def _expand_to_all_rows(self, independent: Sequence[Affine]) -> list[Affine]:
@@ -432,13 +432,13 @@ class Elimination:
 
     @cached_property
     def position_errors(self) -> Program:
-        """Return the program for "c" in C_q (change of q) = c: -C, but 0 in redundant and non-holonomic rows."""
+        """Return the program for "c" in C_q (change of q) = c; c is -C, or 0 in redundant and non-holonomic rows."""
         errors = [*(-violation for violation in self._callback_terms("constraint")), *[self.zero] * self.system.n_a]
         return Program(self.graph, {"c": self._expand_to_all_rows([errors[k] for k in self.choice.rows])})
 
     @cached_property
     def velocity_errors(self) -> Program:
-        """Return the program for "c" in G (change of v) = c: -(C_q v + C_t) and -(A v + b), but 0 in redundant rows."""
+        """Return the program for "c" in G (change of v) = c; c is -(C_q v + C_t), -(A v + b), or 0 if redundant."""
         errors = []
         for row, rate in zip(self.rows, self.rates, strict=True):
             total = rate
@@ -449,7 +449,7 @@ class Elimination:
 
     @cached_property
     def position_projection(self) -> Program:
-        """Return the program for "q" (n_q,) after one Newton step towards C = 0, and for its change "moved" (n_q,)."""
+        """Return the program for "q" (n_q,) after one Newton step towards C = 0, and for "moved", the change of q."""
         moved = self._correction(self.position_errors)
         position = {"moved": moved, "q": [x + change for x, change in zip(self.q, moved, strict=True)]}
         return Program(self.graph, position, self.conditions)
@@ -458,7 +458,7 @@ class Elimination:
     def projection(self) -> Program:
         """Return the program for the projected state "q", "v", the change "moved" of q, and "a", "lam" at projected v.
 
-        M, G and Q are evaluated at the position before the projection. "lam" (n_c + n_a,) has the least norm.
+        M, G and forces are evaluated at the position before the projection. "lam" (n_c + n_a,) has the least norm.
         """
         arrays = self.basic_projection.arrays
         independent = [arrays["lam"][k] for k in self.choice.rows]
@@ -520,8 +520,8 @@ def multipliers_of_least_norm(
 class FactorAndSolvePrograms:
     """Programs that solve M a + G^T lam = r, G a = c in two steps: first the factors, then the solution with them.
 
-    other_programs : programs that run after the first step, at the same state. If the first step computes a quantity
-        that they need, it stores it, too.
+    other_programs : programs that run after the first step, at the same state. The first step also stores quantities
+        that it has computed and that these programs need.
     Fields:
     stored_indices : quantities that the first step stores. Keys: indices in the graph of `equations`; values: indices
         in the array of stored quantities, which begins with the factors.
@@ -585,7 +585,7 @@ class FactorAndSolvePrograms:
 
 
 def _shared_quantities(graph: Graph, factors: Sequence[int], other_programs: Sequence[Program]) -> list[int]:
-    """Return the quantities that are computed for `factors` and that `other_programs` need, except `factors`."""
+    """Return the quantities that are computed on the way to `factors`, and that `other_programs` need, too."""
     computed = set(graph.quantities_for(map(graph.quantity, factors)))
     used = {i for program in other_programs for expr in program.expressions for i in expr.terms}
     for program in other_programs:

@@ -22,19 +22,19 @@ from twoloop.generate.parameter_expressions import (
 from twoloop.generate.parameter_expressions import Untraceable as Untraceable
 from twoloop.kernels.evaluation import operations as op
 
-# a derived callback or a Taylor series with more operations is not generated: this would take longer than most runs
+# derived callbacks and Taylor series with more operations are not generated: to trace these takes longer than most runs
 MAX_TRACED_OPERATIONS = 20_000
-# products that differ by a constant factor are recorded once: the factor is taken out. It stays in the arguments if the
-# result might underflow or overflow: if its magnitude is not between MIN_FACTOR and 1 / MIN_FACTOR, or in the squares
-# that make up a power with an exponent above HIGH_EXPONENT
+# products that differ by a constant factor are recorded once, without this factor. But the factor stays in the product
+# if results might underflow or overflow: if |factor| is not between MIN_FACTOR and 1 / MIN_FACTOR, and in the squares
+# by which a power with an exponent above HIGH_EXPONENT is computed
 MIN_FACTOR, HIGH_EXPONENT = 1e-100, 8
-# reason in messages about a callback that compares an expression, or converts it to a number
+# end of the message if a callback compares an expression, or converts an expression to a number
 BRANCHING_REASON = "it branches on, or converts to a number, what depends on t, q or v"
 
 # functions of `math`, replaced by functions that also accept Parameters
 SIN, COS, EXP, LOG, ATAN, SQRT = map(math_function, ("sin", "cos", "exp", "log", "atan", "sqrt"))
 
-_equal = float.__eq__  # compares values of floats or Parameters, for which the operator == raises an exception
+_equal = float.__eq__  # compares two floats or Parameters; for Parameters, the operator == would raise an exception
 _magnitude = float.__abs__  # absolute value as a plain float, also for a Parameter
 
 CONVERSION_REASON = (
@@ -58,7 +58,7 @@ class Graph(SymbolicObject):
         self.input_masks: list[int] = []  # for each quantity, a bit mask of the inputs that it depends on
         self.traced: dict[str, Any] = {}
         self._recorded_quantities: dict[tuple[int, int, int], int] = {}
-        # numbers of factors of products, in the order of first use; keys: `identifier` of the factor. A product begins
+        # place of each factor of products in the order of first use; keys: `identifier` of the factor. A product begins
         # with the factor used first, so that the order of its factors does not depend on the values of parameters
         self._factor_order: dict[int, int] = {}
         self._identifiers: dict[Any, int] = {}  # results of `identifier`, by keys of expressions
@@ -106,7 +106,7 @@ class Graph(SymbolicObject):
         return expr
 
     def identifier(self, expr: "Affine") -> int:
-        """Return an integer that is the same for equal expressions, and faster to compare than their keys."""
+        """Return an integer that is the same for equal expressions; comparing it is faster than comparing keys."""
         if expr.cached_identifier is None:
             expr.cached_identifier = self._identifiers.setdefault(expr.key, len(self._identifiers))
         return expr.cached_identifier
@@ -126,7 +126,7 @@ class Graph(SymbolicObject):
         return self.quantity(quantity)
 
     def quantities_for(self, exprs: Iterable["Affine"], available: Container[int] = ()) -> list[int]:
-        """Return the indices of quantities to be computed for `exprs`, arguments first; `available` ones are known."""
+        """Return the indices of the quantities to compute for `exprs`, arguments first, unless they are `available`."""
         needed: set[int] = set()
         stack = [i for expr in exprs for i in expr.terms]
         while stack:
@@ -138,13 +138,13 @@ class Graph(SymbolicObject):
         return sorted(needed)
 
     def kind(self, i: int) -> int:
-        """Return the kind of the operation that computes quantity i; it must not be an input."""
+        """Return the kind of the operation, such as SINE, that computes quantity i, which must not be an input."""
         operation = self.operations[i]
         assert operation is not None
         return operation[0]
 
     def arguments(self, i: int) -> list["Affine"]:
-        """Return the arguments of the operation that computes a quantity; an empty list for an input."""
+        """Return the arguments of the operation that computes quantity i; an empty list if it is an input."""
         return [expr for expr in (self.operations[i] or ())[1:] if isinstance(expr, Affine)]
 
     def quantities_by_use(self, exprs: Iterable["Affine"], available: Container[int] = ()) -> list[int]:
@@ -155,7 +155,7 @@ class Graph(SymbolicObject):
         while stack:
             i = stack.pop()
             operation = None if i < 0 else self.operations[i]
-            if i < 0:  # ~i is the index of a quantity whose arguments were above it on the stack: they are in `order`
+            if i < 0:  # ~i is a quantity whose arguments were above ~i on the stack: so they are in `order` now
                 order.append(~i)
             elif i not in needed and operation is not None and i not in available:
                 needed.add(i)
@@ -183,7 +183,7 @@ class Graph(SymbolicObject):
         return self.operation(op.PRODUCT, a, b)
 
     def square(self, expr: "Affine", is_high_power: bool) -> "Affine":
-        """Return the square. `is_high_power`: True if it is part of a power with an exponent above HIGH_EXPONENT."""
+        """Return the square; `is_high_power`: whether it is a step to a power with an exponent above HIGH_EXPONENT."""
         return self._product(expr, expr) if is_high_power and expr.terms else self.product(expr, expr)
 
 
@@ -192,7 +192,7 @@ def rounded(value: float) -> Any:
     if type(value) is Parameter:
         return rounded(value.scale), value.powers
     value = float(value)
-    scaled = 4097.0 * value  # Dekker's splitting: the factor 2**12 + 1 makes the difference below round to 41 bits
+    scaled = 4097.0 * value  # Dekker's splitting: with the factor 2**12 + 1, the result below has 41 bits
     return scaled - (scaled - value)
 
 
@@ -237,7 +237,7 @@ class Affine:
         return Affine(self.graph, self.constant * factor, {i: c * factor for i, c in self.terms.items()})
 
     def normalized(self) -> tuple[float, "Affine"]:
-        """Return the coefficient of the quantity with the lowest index, and the expression divided by it."""
+        """Return the coefficient of the quantity with the lowest index, and the expression / this coefficient."""
         first = min(self.terms)
         factor = self.terms[first]
         if type(factor) is float and factor == 1.0:
@@ -266,7 +266,7 @@ class Affine:
         for i, c in other.terms.items():
             total = terms[i] + c if i in terms else c
             if _magnitude(total) <= CANCELLATION_LIMIT * _magnitude(c):
-                terms.pop(i, None)  # None: if total is c, and has underflowed to 0, there is no term
+                terms.pop(i, None)  # no KeyError if i is not in terms, because a new c has underflowed to 0
             else:
                 terms[i] = total
         if _equal(other.constant, 0.0):
@@ -467,7 +467,7 @@ def is_zero(expr: Affine) -> bool:
 
 
 class Derivative:
-    """Derivatives of expressions along a direction; `direction`: its nonzero components, by indices of inputs."""
+    """Directional derivatives of expressions; `direction`: nonzero components of the direction, by index of input."""
 
     def __init__(self, graph: Graph, direction: dict[int, Affine]):
         self.graph = graph
@@ -475,7 +475,7 @@ class Derivative:
         self._input_mask = sum(1 << i for i in direction)  # bit mask of the inputs with components of the direction
 
     def differentiate(self, expr: Affine) -> Affine:
-        """Return the derivative of an expression."""
+        """Return the derivative of an expression along the direction."""
         total = Affine(self.graph, 0.0, {})
         for i, c in expr.terms.items():
             if self.graph.input_masks[i] & self._input_mask:
@@ -483,7 +483,7 @@ class Derivative:
         return total
 
     def _differentiate_quantity(self, i: int) -> Affine:
-        """Return the derivative of quantity i, after those of the quantities that it depends on."""
+        """Return the derivative of quantity i; first compute those of the quantities on which it depends."""
         stack = [i]  # no recursion, because products may be nested more deeply than Python's limit
         while i not in self._derivatives:
             op = self.graph.operations[stack[-1]]
@@ -504,7 +504,7 @@ class Derivative:
         return self._derivatives[i]
 
     def _differentiate_operation(self, i: int, kind: int, first: Affine, second: Affine | None) -> Affine:
-        """Return the derivative of quantity i, the result of an operation on two expressions."""
+        """Return the derivative, along the direction, of quantity i, the result of an operation on expressions."""
         result, change = self.graph.quantity(i), self.differentiate(first)
         if kind == op.PRODUCT:
             assert second is not None

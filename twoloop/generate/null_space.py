@@ -21,8 +21,8 @@ import numpy as np
 
 from twoloop.generate.graph import Affine, is_zero
 
-# accelerations are invalid if a step of refinement changes them by more than this fraction. The relative error that
-# then remains is usually the square of this change, and as large as the change only if a light body loses all digits
+# accelerations are invalid if a step of refinement changes them by more than this fraction. The relative error after
+# refinement is usually the square of the change, and as large as the change only if a light body loses all digits
 LARGEST_CHANGE = 1e-7
 
 
@@ -41,7 +41,7 @@ class Factors:
     conditions : for each row of G, a pair of positive expressions: the magnitude of its pivot, and the magnitude that
         this pivot would have if G had no other rows. If the first is less than a small fraction of the second, the row
         nearly depends on other rows, and results are invalid.
-    mass_pivots : all other pivots. If M is positive definite, those that are not constant are positive.
+    mass_pivots : all other pivots. If M is positive definite, the pivots in this list that vary are positive.
     """
 
     def __init__(self, matrix: dict[tuple[int, int], Affine], size: int, n: int):
@@ -181,7 +181,7 @@ def _order_rows(rows: list[dict[int, Affine]], n: int, pairs: Sequence[tuple[int
 
 
 def _eliminate(neighbours: list[set[int]], rows: Sequence[int]) -> set[int]:
-    """Update `neighbours` as the elimination of `rows` does: connect their neighbours, and return these."""
+    """Connect all neighbours of `rows` with each other, as the elimination of `rows` does; return the neighbours."""
     new_neighbours = set().union(*(neighbours[i] for i in rows)) - set(rows)
     for j in new_neighbours:
         neighbours[j] = (neighbours[j] | new_neighbours) - {*rows, j}
@@ -191,9 +191,9 @@ def _eliminate(neighbours: list[set[int]], rows: Sequence[int]) -> set[int]:
 PivotBlocks = Sequence[tuple[tuple[int, ...], tuple[int, ...]]]  # per block: indices of its one or two rows and columns
 Terms = dict[int, Affine]  # nonzero entries of a row of a matrix; keys: column indices
 
-# a pivot is too small, and accelerations are invalid, if the square of one of these ratios is below this limit: pivot
-# over norm of the entries that it divides; pivot over norm of its column; for a block of two rows, sine of the angle
-# between its columns. A ratio 10^-k costs up to 3 k digits. linalg/dependent_columns.py chooses pivots more strictly
+# accelerations are invalid if the square of one of these ratios is below this limit: a pivot / the norm of the entries
+# that it divides; a pivot / the norm of its column; the sine of the angle between the columns of a block of two rows. A
+# ratio 10^-k costs up to 3 k digits. The choice of pivots before a run (linalg/dependent_columns.py) is stricter
 MIN_PIVOT_SQUARE = 0.03**2
 
 
@@ -237,7 +237,7 @@ class DependentCoordinates:
                 self._substitute(j, self._rows[i])
 
     def _eliminate(self, rows: tuple[int, ...], columns: tuple[int, ...]) -> None:
-        """Solve the equations with indices `rows` in G a = gamma for a[columns]; insert these in later equations."""
+        """Solve the equations `rows` of G a = gamma for a[columns]; insert the solution in the other equations."""
         self.check_length()
         block = [[self._rows[i].get(j, self._zero) for j in columns] for i in rows]
         pivot, inverse = self._inverse(block)
@@ -262,12 +262,12 @@ class DependentCoordinates:
             self._add_conditions(block, columns, pivot, solved)
 
     def check_length(self, n_following: int = 0) -> None:
-        """Raise ReductionFailed if `max_added` operations are not enough for those so far and `n_following` more."""
+        """Raise ReductionFailed if the operations so far, and `n_following` more, are more than `max_added`."""
         if len(self._graph.operations) + n_following > self._max_operations:
             raise ReductionFailed
 
     def _inverse(self, block: list[list[Affine]]) -> tuple[Affine, list[list[Affine]]]:
-        """Return determinant and inverse of a 1x1 or 2x2 block; raise ReductionFailed if it is always singular."""
+        """Return the determinant and inverse of a 1x1 or 2x2 block; raise ReductionFailed if the former is always 0."""
         if len(block) == 1:
             ((determinant,),) = block
         else:
@@ -316,7 +316,7 @@ def solve_reduced_system(
 ) -> tuple[list[Affine], list[tuple[Affine, Affine]]]:
     """Return the accelerations a (n_q,), given M (`mass`), Q (`force`) and the solution a = g + T a_i of constraints.
 
-    Also return conditions under which T^T M T is not singular: pairs of expressions, the first of which is larger.
+    Also return pairs of expressions. If the first is larger than the second in each pair, T^T M T is not singular.
     """
     n, T, g, independent = len(mass), coordinates.T, coordinates.g, coordinates.independent
     zero = Affine(mass[0, 0].graph, 0.0, {})
@@ -338,13 +338,13 @@ def solve_reduced_system(
 
 
 def _pivot_conditions(matrix: dict[tuple[int, int], Affine], factors: Factors) -> Iterator[tuple[Affine, Affine]]:
-    """Yield pairs (pivot, small fraction of diagonal entry) of T^T M T (`matrix`): the first must be larger."""
+    """Yield pairs (pivot, small fraction of diagonal entry) of T^T M T (`matrix`): the pivot must be larger."""
     pivots = iter(factors.mass_pivots)
     for row_indices, _, _ in factors.blocks:
         first_pivot: Affine | None = None
         for i in row_indices:
             pivot = next(pivots)
-            # the second pivot of a block is its determinant: so the diagonal entry is multiplied by the first pivot
+            # the determinant of a block is its second pivot: so the diagonal entry is multiplied by the first pivot
             scale = matrix[i, i] if first_pivot is None else first_pivot * matrix[i, i]
             first_pivot = pivot
             if pivot.terms:
@@ -376,9 +376,9 @@ def solve_refined(
     `solve`: function that solves linear systems with the matrix [M + S, G^T; G 0], where S is 0, or terms that make
     M definite (see PivotChoice).
 
-    There is one condition if one step of refinement has improved the solution, otherwise none. It is a pair of
-    expressions: if the first is not larger, the step has changed a too much. The change is compared with a and, as
-    a is small near equilibrium, with the accelerations that the forces r would cause without constraints.
+    If a step of refinement has improved the solution, there is one condition, otherwise none. The condition is a pair
+    of expressions: if the first is not larger than the second, refinement has changed a too much. The change is
+    compared with a and, as a is small near equilibrium, with the accelerations by the forces r without constraints.
     """
 
     def solve_once(r: Sequence[Affine], c: Mapping[int, Affine] | Sequence[Affine]) -> list[Affine]:

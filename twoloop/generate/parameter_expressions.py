@@ -1,7 +1,7 @@
 """Compute with numbers that record how they depend on parameters, so that one trace serves all parameter values.
 
-A `Parameter` is a float: callbacks compute with it as with any other float, and results are Parameters, too. Its value
-during the trace is a random number, so that no terms cancel that would not cancel for other values.
+A `Parameter` is a float: callbacks compute with it as with any other float, and results are Parameters, too. During the
+trace, a Parameter has a random value, so that terms cancel only if they cancel for all values.
 """
 
 import math
@@ -19,9 +19,9 @@ Array = NDArray[np.float64]
 # product of powers as pairs (index of the base in ParameterTape.atoms, exponent); the empty tuple is the number 1
 Powers = tuple[tuple[int, float], ...]
 
-MAX_TERMS = 200  # a callback is not traced if it adds up more terms with parameters: long sums are slow to compare
+MAX_TERMS = 200  # a callback is not traced if a sum has more terms with parameters: long sums are slow to compare
 _as_float = float.__pos__  # converts a Parameter to a float; float(x) raises an exception while callbacks are traced
-# two terms cancel if their sum is at most this fraction of the second term
+# the sum of two terms counts as zero if its magnitude is at most this fraction of the second term
 CANCELLATION_LIMIT = 8.0 * 2.0**-52
 NUMBER_TYPES = (int, float, np.number)  # types that count as numbers; Parameter is a subclass of float
 _UNARY_FUNCTIONS = ("sin", "cos", "tan", "sqrt", "exp", "log", "arctan", "sinh", "cosh", "tanh", "absolute")
@@ -82,7 +82,7 @@ class SymbolicObject:
 class ParameterTape(SymbolicObject):
     """Record of how numbers were computed from parameters.
 
-    Each number is a constant times a product of powers of atoms: parameters, sums, or functions of such numbers.
+    Each number is a constant times a product of powers of atoms. Atoms are parameters, sums, and functions of numbers.
 
     values : values of all parameters during the trace; random for parameters that vary, see the module docstring.
     varying : indices of the parameters that vary; the others are constants.
@@ -98,7 +98,7 @@ class ParameterTape(SymbolicObject):
             self.parameters[i] = Parameter(float(values[i]), self, 1.0, ((i, 1.0),))
 
     def atom(self, definition: Any) -> Powers:
-        """Return the atom with a definition ("sum", terms) or (function name, arguments), as Powers."""
+        """Return, as Powers, the atom that is defined by ("sum", terms) or by (name of a function, arguments)."""
         if definition not in self._atom_indices:
             self._atom_indices[definition] = len(self.atoms)
             self.atoms.append(definition)
@@ -185,7 +185,7 @@ class Parameter(float):
         return elementwise(lambda *arguments: apply_function(name, *arguments), inputs, out)
 
     def _refuse_decision(self, reason: str = "it branches on its parameters, or rounds them") -> None:
-        """Refuse an operation that reveals this number's value to a callback; modules of `twoloop.generate` may."""
+        """Refuse an operation that reveals a Parameter's value, unless a module of `twoloop.generate` calls it."""
         caller = sys._getframe(2).f_globals.get("__name__", "")
         if self.tape.is_tracing and not caller.startswith(__name__.rpartition(".")[0]):
             self.tape.refuse(reason)
@@ -332,7 +332,7 @@ for _name in _UNARY_FUNCTIONS:
 
 
 def elementwise(function: Callable[..., Any], inputs: Iterable[Any], out: Any = None) -> Any:
-    """Return the array of function(x, ...) for the entries x, ... of arrays; if `out` is given, fill out[0] with it."""
+    """Apply a function to the entries of arrays, as a ufunc does; return the results, stored in out[0] if given."""
     operands = list(map(_object_array, inputs))
     results = np.frompyfunc(function, len(operands), 1)(*operands)
     if out is None:
@@ -362,6 +362,6 @@ def as_number(value: Any) -> float:
 
 
 def math_function(name: str) -> Callable[[float], float]:
-    """Return the function `name` of `math`, with an addition: for a Parameter, it returns a Parameter."""
+    """Return the function `name` of `math`, extended: if the argument is a Parameter, the result is a Parameter."""
     function = getattr(math, name)
     return lambda x: apply_function(name, x) if type(x) is Parameter else function(x)

@@ -26,7 +26,7 @@ T = TypeVar("T")
 
 N_COMPARED = 5  # number of states at which a user's traced function is compared with calls of the function
 TIME_SPACING = 0.37  # time (s) between successive compared states; unlikely to be the period of a force
-MAX_TRACE_DIFFERENCE = 1e-10  # a trace is wrong if it differs from a call by more (relative): this is no rounding error
+MAX_TRACE_DIFFERENCE = 1e-10  # a trace is wrong if its relative difference from a call is larger than rounding errors
 
 # cost of operations by kind, in multiplications; the cost of other operations is not counted
 COSTS = {op.PRODUCT: 1, op.RECIPROCAL: 4}
@@ -79,7 +79,7 @@ class Algebra(Generic[T]):
 
 @dataclass(frozen=True)
 class Program:
-    """Arrays to be computed from the inputs of a graph, and conditions under which they are valid.
+    """Arrays to be computed from the inputs of a graph, and conditions under which these arrays are valid.
 
     arrays : names of the arrays, and their entries: affine expressions.
     conditions : pairs of expressions. The arrays are valid if in each pair the first is larger than the second.
@@ -90,13 +90,13 @@ class Program:
     conditions: list[tuple[Affine, Affine]] = field(default_factory=list)
 
     def run(self, algebra: Algebra[T], inputs: Sequence[T] = ()) -> list[list[T]]:
-        """Execute the program in an algebra; return its arrays. `inputs`: values of the first inputs of the graph."""
+        """Execute the program in an algebra; return the arrays. `inputs`: values of the first inputs of the graph."""
         for quantity, value in enumerate(inputs):
             algebra.define(quantity, value)
         return algebra.run_program(self)
 
     def quantities(self, available: Container[int] = ()) -> list[int]:
-        """Return the indices of quantities to compute for the arrays and conditions if `available` ones are known."""
+        """Return the indices of the quantities to compute for arrays and conditions, except `available` quantities."""
         return self.graph.quantities_for(self.expressions, available)
 
     def cost(self) -> int:
@@ -123,7 +123,7 @@ class Program:
 class ArrayAlgebra(Algebra[Any]):
     """Algebra in which a value is an array (n_runs,), with one number for each run, or one number for all runs.
 
-    tape, parameters : tape of the coefficients that are Parameters; values of its parameters, (n_runs, n_p).
+    tape : record of how coefficients depend on parameters. parameters : their values, (n_runs, n_p).
     """
 
     functions: Mapping[int, Callable[[Any], Any]] = MappingProxyType(
@@ -202,7 +202,7 @@ class OperationTable(NamedTuple):
         )
 
     def as_floats(self) -> list[float]:
-        """Return the table as floats, to be stored among the parameters of a model; results are its first nodes."""
+        """Return the table as floats, to be stored among the parameters of a model; results become nodes 0, 1, ..."""
         rows = self.rows.copy()
         is_result = rows[:, KIND] == RESULT
         n_results = int(is_result.sum())
@@ -212,7 +212,7 @@ class OperationTable(NamedTuple):
         return [float(x) for part in parts for x in part]
 
     def as_arrays(self, result_indices: Sequence[int]) -> tuple[Any, Any]:
-        """Return the table as integers and floats for a derived callback; `result_indices`: indices in its output."""
+        """Return integers and floats for a derived callback; `result_indices`: where in its output to store results."""
         rows, n = self.rows.copy(), len(result_indices)
         rows[rows[:, KIND] == RESULT, NODE] += self.n_nodes
         header = [self.n_nodes + n, len(rows), len(self.columns), n]
@@ -231,9 +231,9 @@ LITERAL_TOLERANCE = 8.0 * 2.0**-52  # largest difference between a coefficient a
 
 
 class Coefficient(float):
-    """Coefficient that generated code reads from an array; it is equal only to itself, even if values are equal.
+    """Coefficient that generated code reads from an array; two Coefficients with equal values are not equal.
 
-    `index`: index in the array. `varies`: whether this is the array of coefficients that vary with parameters.
+    `index`: index in the array. `varies`: whether this array has the coefficients that vary with parameters.
     """
 
     __slots__ = ("index", "varies")

@@ -1,10 +1,10 @@
 """Make the program (list of operations) that taylor_step.py repeats to compute Taylor series of a mechanism's motion.
 
 The motion satisfies G v + (C_t, b) = 0 and M a + G^T lam = Q. G = [C_q; A] are the rows of all constraints, C_t
-and b the parts of their rates that do not depend on v, and lam the multipliers.
+and b the parts of the constraints' rates that do not depend on v, lam the multipliers, and Q the forces.
 
-An operation is "early" if it depends on time and coordinates only, as for G and M, and "late" if it depends on
-velocities, too. In G v and G^T lam + M a, terms that share a factor become one product.
+An operation is "early" if it depends on time and coordinates only, as in entries of G and M, and "late" if it depends
+on velocities, too. In G v and G^T lam + M a, terms that share a factor become one product.
 """
 
 from collections.abc import Container, Sequence
@@ -38,7 +38,7 @@ class Sums(NamedTuple):
     column: Integers  # for each expression, the index of the quantity in its first term
     coefficient: Array  # for each expression, the coefficient of its first term
     constant: Array  # for each expression, its constant
-    row: Integers  # for each further term, the index of its expression (in `rows` and `balance`: of the equation)
+    row: Integers  # for each further term, the index of its expression; in `SeriesProgram.rows`, of its equation
     further_column: Integers  # for each further term (not the first one of an expression), the index of its quantity
     further_coefficient: Array  # for each further term, its coefficient
 
@@ -86,7 +86,7 @@ class SeriesProgram:
         return len(self.early.first.column) + len(self.late.first.column)
 
     def specialize(self, system: ConstrainedSystem, evaluate: Evaluator) -> "SeriesProgram":
-        """Return a copy of the program for one system; `evaluate` computes coefficients for its parameters."""
+        """Return a copy of the program for one system; `evaluate` computes coefficients for the system's parameters."""
 
         def specialized(exprs: Sums) -> Sums:
             coefficient, constant = evaluate(exprs.coefficient), evaluate(exprs.constant)
@@ -167,7 +167,7 @@ def series_program(
 
 
 def _find_sums(graph: Graph) -> dict[int, Affine]:
-    """Return the affine expression of each quantity that is a sum: it replaces the quantity in other expressions."""
+    """Return, for each quantity that is a sum, the affine expression that replaces it in other expressions."""
     sums: dict[int, Affine] = {}
     for i, operation in enumerate(graph.operations):
         if operation is not None and operation[0] == SUM:
@@ -197,8 +197,8 @@ def _sum_of_products(
     """Return rest + sum_i factors[i] multipliers[i], with few products; new products are added to the dict `products`.
 
     There are two ways: (1) terms with equal factors share a product; (2) each factor is split into its quantities, and
-    terms with the same quantity share a product. The way with fewer new products is taken. If both have as many, it is
-    (2) if `of_rates` (for G v + (C_t, b)), else (1): (2) may yield (cos x) x', the rate of sin x, which costs nothing.
+    terms with the same quantity share a product. The way with fewer new products is taken. If both need as many, (2)
+    is taken for `of_rates` (for G v + (C_t, b)), else (1): (2) may yield (cos x) x', a rate that costs nothing.
     """
     total = rest
     by_factor: dict[Any, tuple[Affine, Affine]] = {}
@@ -296,7 +296,7 @@ def _needed_operations(graph: Graph, exprs: list[Affine]) -> list[tuple[int, Any
 
 
 def _nonzero_sums(exprs: list[Affine], nodes: dict[int, int]) -> tuple[Sums, Integers]:
-    """Return the nonzero expressions as Sums, and their indices in `exprs`, with which Sums.row is renumbered."""
+    """Return the nonzero expressions as Sums, whose `row` is an index in `exprs`; and the indices of all these."""
     indices = [k for k, expr in enumerate(exprs) if expr.terms or expr.constant]
     sums = _convert_to_sums([exprs[k] for k in indices], nodes)
     index_array = np.array(indices, dtype=np.int64)
@@ -308,7 +308,7 @@ def _remove_terms(expr: Affine, inputs: Container[int]) -> Affine:
 
 
 def _grouped_operations(operations: list[Any]) -> list[tuple[int, list[Any]]]:
-    """Sort operations into groups of one kind that depend on earlier groups only; return pairs (kind, operations)."""
+    """Sort operations into groups of one kind; a group depends on earlier groups only. Return (kind, operations)."""
     nodes = {node for node, *_ in operations}
     levels: dict[int, int] = {}
     groups: dict[tuple[int, int], list[Any]] = {}

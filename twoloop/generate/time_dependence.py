@@ -1,7 +1,7 @@
 """Decide from traces whether forces or drives may act for a short time, or vary much over a short distance.
 
 The formulas of the callbacks decide. A *short pulse* is a large value only in a short range of t, or of q or v, such as
-that of 1 / (1 + x^4) or of a high power of a sine. Evaluations at the steps of a run may miss it.
+that of 1 / (1 + x^4) or of a high power of a sine. Evaluations at the steps of a run may miss such a pulse.
 """
 
 import math
@@ -36,7 +36,7 @@ MAX_DEGREE_OF_STATE = 32  # polynomials in q and v of a higher degree, and their
 MAX_DEGREE_OF_DIVISOR = 4  # a quotient may have short pulses if its divisors have a higher total degree in q and v
 FASTEST_DECAY = -2.0  # a quantity may have short pulses if it decays as x^p with p below this value, like 1 / (1 + x^4)
 MAX_RATE = 4.0  # a force may be steep if it has a sine or cosine of x, and dx/dq or dx/dv is larger than this
-# systems with more coordinates are not traced for this analysis: that may take ten times as long as sampling the forces
+# larger systems are not traced for this analysis: tracing may take ten times as long as sampling the forces
 MAX_COORDINATES = 300
 TIME_MASK = 1  # a quantity depends on t (input 0 of the graph) if this bit is 1 in its entry of `Graph.input_masks`
 
@@ -65,7 +65,7 @@ def find_short_forces(system: ConstrainedSystem, force_was_traced: bool) -> Shor
 
     If callbacks cannot be traced, `by_time` and `by_state` are True. Systems with more than MAX_COORDINATES coordinates
     are not traced; then `by_time` is True, and `by_state` is False. Callbacks that are called in Python may store their
-    arguments, so symbols might reach later calls: they are traced only if the force was (`force_was_traced`).
+    arguments, so symbols might reach later calls. Such callbacks are traced only if `force_was_traced` is True.
     """
     if system.n_q > MAX_COORDINATES:
         return ShortForces(True, False)
@@ -76,8 +76,8 @@ def find_short_forces(system: ConstrainedSystem, force_was_traced: bool) -> Shor
 def forces_may_be_steep(system: ConstrainedSystem, force_was_traced: bool) -> bool:
     """Return whether forces or drives may act for a short time, or vary much over a distance shorter than a step.
 
-    Then long steps are not safe: a step might evaluate the force 1 / (1 + (x / w)**2) on both sides of its peak only,
-    or a fast vibration at nearly equal phases. `force_was_traced`: see `find_short_forces`.
+    If they may, long steps are not safe: a step might evaluate the force 1 / (1 + (x / w)**2) only on both sides of the
+    peak, or a fast vibration at nearly equal phases. `force_was_traced`: see `find_short_forces`.
     """
     if any(find_short_forces(system, force_was_traced)):
         return True
@@ -86,7 +86,7 @@ def forces_may_be_steep(system: ConstrainedSystem, force_was_traced: bool) -> bo
 
 
 def _dependence(system: ConstrainedSystem, force_was_traced: bool) -> Dependence | None:
-    """Return the analysis of a system from the cache, or make it; None if callbacks cannot or must not be traced."""
+    """Return the analysis of a system, cached or new; None if callbacks cannot or must not be traced."""
     if system.called_in_python and not force_was_traced:
         return None
     try:
@@ -114,7 +114,7 @@ def _make_analysis(system: ConstrainedSystem) -> Any:
 
 
 class DegreeAlgebra(Algebra[float]):
-    """Algebra whose values are degrees as polynomials in `inputs`; sin x, 1 / x, ... have the degree of x."""
+    """Algebra whose values are degrees of quantities as polynomials in `inputs`; sin x, 1 / x, ... count like x."""
 
     functions: Mapping[int, Callable[[float], float]] = MappingProxyType(
         {
@@ -153,9 +153,9 @@ class GrowthExponents(DegreeAlgebra):
 
 
 class DivisorDegrees(DegreeAlgebra):
-    """Algebra whose values are total degrees of divisors: the sum of the factors', or the largest of the terms'.
+    """Algebra whose values are total degrees of a quantity's divisors: a sum over factors, a maximum over terms.
 
-    `degrees`: degrees of all quantities. Arguments of arctangents count, too: derivatives of arctangents are quotients.
+    `degrees`: degrees of all quantities. Arguments of arctangents count as divisors, as derivatives are quotients.
     """
 
     def __init__(self, degrees: DegreeAlgebra):

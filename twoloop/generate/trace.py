@@ -47,7 +47,7 @@ from twoloop.kernels.compile.dependencies import FunctionCopier, is_library
 from twoloop.kernels.compile.linking import Dispatcher
 from twoloop.problem.system import ConstrainedSystem
 
-# functions of NumPy that callbacks may call on symbols: they handle arrays of expressions like arrays of numbers
+# functions of NumPy that callbacks may call on symbols, because they handle arrays of objects like arrays of numbers
 NUMPY_FUNCTIONS = {
     *("add", "append", "atleast_1d", "atleast_2d", "block", "column_stack", "concatenate", "copy", "cross", "diag"),
     *("diagonal", "divide", "dot", "einsum", "expand_dims", "flip", "hstack", "inner", "kron", "matmul", "mean"),
@@ -55,7 +55,7 @@ NUMPY_FUNCTIONS = {
     *("size", "square", "squeeze", "stack", "subtract", "sum", "tile", "trace", "transpose", "true_divide", "vdot"),
     *("vstack", "zeros_like", "ones_like", "empty_like", "full_like"),
 }
-# functions of NumPy that are replaced while callbacks are traced, so that the arrays can contain expressions
+# functions of NumPy that are replaced while callbacks are traced, so that their arrays can contain expressions
 ARRAY_CONSTRUCTORS = ("zeros", "ones", "empty")
 ARRAY_CONVERSIONS = ("array", "asarray", "ascontiguousarray")
 
@@ -265,7 +265,7 @@ TRACING_ORDER = (
     *("constraint", "constraint_rate", "jacobian", "nonholonomic", "nonholonomic_rate", "mass", "force"),
     *("gamma", "nonholonomic_gamma"),
 )
-# keys: callbacks for gamma; values: callbacks from whose derivatives it also follows (C_q and C_t; A and b)
+# keys: callbacks for gamma; values: callbacks from whose derivatives gamma also follows (C_q and C_t, or A and b)
 GAMMA_SOURCES = {"gamma": ("jacobian", "constraint_rate"), "nonholonomic_gamma": ("nonholonomic", "nonholonomic_rate")}
 
 
@@ -296,7 +296,7 @@ class Equations:
         return self
 
     def copy(self) -> "Equations":
-        """Return a copy with its own graph, which may be extended; it uses the traces of this object."""
+        """Return a copy with its own graph, which may be extended; the copy uses the traces of this object."""
         equations = copy.copy(self)
         equations.graph = self.graph.copy()
         equations.t, equations.q, equations.v = (
@@ -309,8 +309,8 @@ class Equations:
     def expressions(self, kind: str, v: Sequence[Affine] | None = None) -> Any:
         """Return the result of a callback, such as "mass", as an array of expressions of t, q and v.
 
-        If the system has no such callback, C_q and gamma are derived from others; all other results are zeros. `v`:
-        expressions that replace the inputs `self.v`. Raise Untraceable if a callback does not run on symbols.
+        If the system has no such callback, C_q and gamma are derived from other callbacks; other results are zeros.
+        `v`: expressions that replace the inputs `self.v`. Raise Untraceable if a callback does not run on symbols.
         """
         if v is not None and "v" in KINDS[kind].state:
             return self._derive_or_trace(kind, v)
@@ -319,7 +319,7 @@ class Equations:
         return self._expressions[kind].copy()
 
     def derivatives(self, kind: str, v: Sequence[Affine] | None = None) -> Any:
-        """Return C_q, C_t or gamma as derivatives of other callbacks, even if the system has a callback for it."""
+        """Return C_q, C_t or gamma as derivatives of other callbacks, even if the system has a callback `kind`."""
         if kind == "jacobian":
             return self._jacobian()
         if kind == "constraint_rate":
@@ -328,7 +328,7 @@ class Equations:
         return self._gamma(*GAMMA_SOURCES[kind], self.v if v is None else v)
 
     def _derive_or_trace(self, kind: str, v: Sequence[Affine]) -> Any:
-        """Return C_q or gamma as derivatives if the system has no callback for it; otherwise, the callback's trace."""
+        """Return the trace of the callback `kind`; if the system does not have it, derive C_q and gamma from others."""
         if self._is_derived(kind):
             return self.derivatives(kind, v)
         if kind in self._results_before_copy and v is self.v:
@@ -373,7 +373,7 @@ class Equations:
         return jacobian
 
     def _gamma(self, rows: str, rates: str, v: Sequence[Affine]) -> Any:
-        """Return gamma = -d/dt(G v + r) at constant v; `rows`, `rates`: callbacks for G and r: C_q, C_t, or A, b."""
+        """Return gamma = -d/dt(R v + r), v constant; `rows`: callback for R (C_q or A); `rates`: for r (C_t or b)."""
         direction = {only_quantity(coordinate): u for coordinate, u in zip(self.q, v, strict=True)}
         total_derivative = Derivative(self.graph, {only_quantity(self.t): Affine(self.graph, 1.0, {}), **direction})
         gamma = self.expressions(rates)
@@ -386,7 +386,7 @@ class Equations:
 
 
 def runs_on_symbols(system: ConstrainedSystem, kind: str, parameters: Any) -> bool:
-    """Return whether a compiled callback can be traced with these parameters, if some of them are Parameters."""
+    """Return whether a compiled callback can be traced with `parameters`, some of which are Parameters."""
     equations = Equations(system, parameters)
     state = {"q": equations.q, "v": equations.v, "lam": equations.graph.inputs(system.n_c, True)}
     arrays = [symbol_array(state[name]) for name in KINDS[kind].state]
@@ -408,7 +408,7 @@ def only_quantity(expr: Affine) -> int:
 
 
 Array = NDArray[np.float64]
-# array of expressions in parameters, as (scales, indices, products): its entry i is scales[i] * products[indices[i]]
+# array of expressions in parameters, as (scales, indices, products): entry i is scales[i] * products[indices[i]]
 ScaledProducts = tuple[Array, NDArray[np.int64], list[Powers]]
 Evaluator = Callable[[Any], Array]  # function that evaluates arrays of expressions for the parameters of one system
 
@@ -593,9 +593,9 @@ class ParameterArrays:
     """Arrays of numbers that stand for arrays of expressions; `write` overwrites them by values for new parameters."""
 
     def __init__(self) -> None:
-        # keys: id(array of expressions); values: this array, stored so that no other gets its id; the array of numbers
+        # keys: id of an array of expressions; values: this array, so that no other gets its id, and its numbers
         self._arrays: dict[int, tuple[Any, Array]] = {}
-        # for each array: its numbers, flat; indices of the entries that vary; range of these in `values` of `write`
+        # for each array: its numbers, flat; indices of entries that vary; where `values` in `write` has these entries
         self._number_arrays: list[tuple[Array, NDArray[np.int64], slice]] = []
         self._products: dict[Powers, int] = {}
         self._scales: list[float] = []

@@ -29,22 +29,20 @@ KINDS = (
     *("mass", "force", "constraint", "jacobian", "constraint_rate", "gamma"),
     *("nonholonomic", "nonholonomic_rate", "nonholonomic_gamma"),
 )
-N_NEARBY = 8  # before a run, calls and traces are compared at the start and at this number of random states near it
+N_NEARBY = 8  # before a run, calls and traces are compared at the start, and at this number of random states nearby
 RELATIVE_TIMES = np.linspace(0.0, 1.0, N_NEARBY)  # times of the random states, from 0 (start of the run) to 1 (its end)
 NEARBY_DISTANCE = 0.3  # largest distance of a random position from the start, relative to the sizes of the coordinates
 MAX_STATES_OF_CHUNK = 32  # a `Sample` takes at most about this number of states from one chunk of steps
 MAX_STATES = 64  # about the largest number of states at which traces are compared; largest number of chunks in `Sample`
 MAX_STATES_IN_PYTHON = 9  # the same as MAX_STATES, for comparisons with callbacks that are called in Python
 MAX_ENTRIES = 20_000  # about the largest number of entries that are compared: for large systems, fewer states suffice
-# limits of the difference between call and trace, relative to the largest term that the trace adds up in any entry of
-# the callback's result. Up to ROUNDING_DIFFERENCE, it is a rounding error; above CLEAR_DIFFERENCE, the trace is wrong;
-# in between, `_is_systematic` decides
-ROUNDING_DIFFERENCE = 16.0 * np.finfo(float).eps
-CLEAR_DIFFERENCE = 1e-6
+# differences of call and trace are relative to the largest term that the trace adds up in any entry of the result
+ROUNDING_DIFFERENCE = 16.0 * np.finfo(float).eps  # a relative difference up to this is a rounding error
+CLEAR_DIFFERENCE = 1e-6  # above this relative difference, the trace is wrong; below, `_is_systematic` decides
 # `_is_systematic` compares call and trace at N_NEIGHBOURS states, whose relative distance is at most PERTURBATION
 PERTURBATION, N_NEIGHBOURS = 1e-7, 12
-MARGIN = 0.01  # a CheckedRegion extends the range of checked states by this fraction, which is less than most steps
-MARGIN_AT_REST = 1e-9  # it also extends all ranges by this fraction of the largest: coordinates at rest have range 0
+MARGIN = 0.01  # a CheckedRegion extends the range of each entry of checked states [t, q, v] by this * (max - min)
+MARGIN_AT_REST = 1e-9  # all ranges are also extended by this * the largest range of q and v: at rest, a range is 0
 
 
 class CallbackTraces:
@@ -74,7 +72,7 @@ class CallbackTraces:
         self.program = OperationTable.from_results(graph, 1 + 2 * system.n_q, results)
 
     def specialize(self, system: ConstrainedSystem, evaluate: Evaluator) -> "CallbackTraces":
-        """Return a copy for another system; `evaluate`: function that computes coefficients for its parameters."""
+        """Return a copy for `system`; `evaluate`: function that computes coefficients for the system's parameters."""
         traced = self.replace_coefficients(evaluate)
         traced.name = system.name
         return traced
@@ -107,7 +105,7 @@ class CallbackTraces:
     def difference(self, system: ConstrainedSystem, states: Array, everywhere: bool = True) -> str | None:
         """Return a message about the first difference of calls and traces at states [t, q, v], or None if they agree.
 
-        `everywhere`: whether calls that return NaN or inf are compared: then the trace must not be finite either.
+        If `everywhere`, the trace must not be finite where a call returns NaN or inf; else such values are ignored.
         """
         from twoloop.kernels.evaluation import checks as kernels
 
@@ -153,7 +151,7 @@ class CallbackTraces:
         return n_different, called, traced, bounds
 
     def _is_systematic(self, system: ConstrainedSystem, state: Array, entry: int) -> bool:
-        """Return True if, at states nearby, call - trace has one sign and similar sizes; rounding errors vary."""
+        """Return True if call - trace has the same sign and a similar size at nearby states; rounding errors vary."""
         directions = np.random.default_rng(5).uniform(-1.0, 1.0, (N_NEIGHBOURS, len(state)))
         _, called, traced, _ = self._evaluate(system.kit, state * (1.0 + PERTURBATION * directions))
         errors = (called - traced)[:, entry]
@@ -171,14 +169,14 @@ class CallbackTraces:
 
 
 class Sample:
-    """States [t, q, v] of a run for the comparison after it; of a long run, every k-th. `n`: length of [q, v]."""
+    """States [t, q, v] of a run, or every k-th, for the comparison after the run; `n`: length of [q, v]."""
 
     def __init__(self, t: float, state: Array, n: int) -> None:
         self._n, self._chunks = n, list[Array]()
         self.add(state[:0], state[None, :][:0], t, state)
 
     def add(self, t: Array, rows: Array, end: float, state: Array) -> None:
-        """Add states of successive steps, or every k-th of many: `rows` [q, v, ...] at times `t`, `state` at `end`."""
+        """Add states of successive steps: `rows` [q, v, ...] at times `t` (if many, every k-th), `state` at `end`."""
         stride = 1 + len(t) // MAX_STATES_OF_CHUNK
         times = t[::stride]
         states = np.empty((len(times) + 1, 1 + self._n))
