@@ -54,7 +54,7 @@ class Tables(NamedTuple):
     velocities, positions : single and double integrals of p from 0 to each of c_1 to c_8.
     values_between, velocities_between, positions_between : p at the midpoints; its single and double integrals there.
     spectrum : coefficients of p in the Legendre polynomials of degree 1 to 8 on [0, 1]; these polynomials are 1 at 1.
-    begin, end : coefficients of p in the powers 1 to 8 of x (`begin`), and in those of x - 1 (`end`).
+    begin, end : coefficients of p in the powers 1 to 8 of x (`begin`), and in the powers 1 to 8 of x - 1 (`end`).
     """
 
     nodes: Array
@@ -77,7 +77,7 @@ def tables() -> Tables:
     values = _legendre(x)
     weights = 2 / (N * (N - 1) * values[N - 1] ** 2)
     norms = np.array([np.longdouble(2) / (2 * k + 1) for k in range(N)])
-    norms[N - 1] = np.longdouble(2) / (N - 1)  # integral of P_8^2 by a sum over the nodes; exact: 2 / 17
+    norms[N - 1] = np.longdouble(2) / (N - 1)  # the sum over the nodes for the integral of P_8^2, which is 2 / 17
     coefficients = values[:N] * weights / norms[:, None]  # [k, j]: coefficient of P_k in Lagrange polynomial j
     powers = [
         np.array([[sign ** (n + k) * comb(n, k) * comb(n + k, k) for n in range(N)] for k in range(1, N)]).T
@@ -114,36 +114,36 @@ def _integrals(coefficients: Extended, z: Extended) -> tuple[Extended, Extended,
     points z are on [-1, 1]; integrals are over the time (z + 1) / 2, and begin at 0.
     """
     values = _legendre(z)
-    # integral of P_k over z from -1: (P_k+1 - P_k-1) / (2 k + 1), or P_1 + 1 if k = 0; the same rule yields `double`
+    # integral of the Legendre polynomial P_k from -1 to z: (P_k+1 - P_k-1) / (2 k + 1); if k = 0, it is P_1 + 1
     single = np.array([values[1] + 1, *((values[k + 1] - values[k - 1]) / (2 * k + 1) for k in range(1, N + 1))])
     double = np.array([single[1] + single[0], *((single[k + 1] - single[k - 1]) / (2 * k + 1) for k in range(1, N))])
     return coefficients.T @ values[:N], coefficients.T @ single[:N] / 2, coefficients.T @ double / 4
 
 
 MAX_OPERATIONS = 5000  # equations with more operations get no collocation code: to compile it would take more than 2 s
-MIN_DIVISOR = 1e-300  # smaller divisors and allowed errors are replaced by this, so that nothing is divided by zero
+MIN_DIVISOR = 1e-300  # this replaces smaller divisors and smaller allowed errors, so that no division by zero occurs
 INVALID = -1.0  # returned by `find_defect` instead of a defect (at least 0), if accelerations cannot be computed
 INFINITE = float("inf")
-# if pivots chosen before the run get too small in a step, this step and this number of later steps are computed by an
-# elimination that needs no such pivots, because it begins with the mass matrix M
+# the pivots of the elimination are chosen before the run. If a pivot is too small in a step, another elimination, which
+# begins with the mass matrix M, computes the accelerations in this step and in this number of later steps
 STEPS_BY_MASS_FIRST = 8.0
 FIRST_DEGREE = 3.0  # degree of the polynomial that predicts the accelerations in the second step of a run
 
-# for the fixed-point iteration. Contraction: change of velocities by a sweep / change by the sweep before
+# contraction rho: change of velocities by a sweep (one iteration for all stages) / their change by the sweep before
 KAPPA = 0.02  # sweeps end if the estimated error of the iteration, relative to the tolerances, is at most this
-TARGET_SWEEPS = 6.0  # step sizes are chosen for this number of sweeps; +1 if the prediction has degree 6, +2 if 7 or 8
+TARGET_SWEEPS = 6.0  # number of sweeps (iterations) in which a step should converge: the step size is chosen for this
 EXTRA_SWEEPS = 7  # a step is rejected if it has not converged after the target number of sweeps and this number more
-MAX_CONTRACTION = 0.8  # if the contraction is at least this in the fourth sweep or later, the step is rejected
-MIN_RHO, MAX_RHO = 1e-3, 0.9  # bounds to which a measured contraction is clipped
-FAST_START, SLOW_START = 0.04, 0.3  # a guessed first step size is kept if the contraction in sweep 2 is between these
-STAGNATION_RATIO = 0.5  # sweeps also end if the change may be rounding error and is at least this times the last change
-# for steps of fixed size: limit of the error of the iteration (as KAPPA), size of changes that may be rounding errors
-# (as MAX_ROUNDING), and largest number of sweeps
+MAX_CONTRACTION = 0.8  # if changes by successive sweeps have at least this ratio in sweep 4 or later, reject the step
+MIN_RHO, MAX_RHO = 1e-3, 0.9  # the ratio rho of changes by successive sweeps is clipped to these bounds
+FAST_START, SLOW_START = 0.04, 0.3  # if rho is outside these bounds in sweep 2, a guessed first step size is changed
+STAGNATION_RATIO = 0.5  # sweeps also end if a change may be a rounding error, and is at least this * the change before
+# with steps of fixed size, sweeps (iterations) end if the error of the iteration is at most KAPPA_OF_FIXED * tolerance,
+# if changes are below ROUNDING_OF_FIXED * |v| (v: velocities) and decay no more, or after MAX_SWEEPS_OF_FIXED
 KAPPA_OF_FIXED, ROUNDING_OF_FIXED, MAX_SWEEPS_OF_FIXED = 1e-16, 1e-9, 60.0
 SMALLEST_RATIO = 1e-30  # added to (error of the iteration) / KAPPA before its logarithm is taken: the error may be 0
-ERROR_WEIGHT = 0.5  # factor on the estimated error of a step, see `_estimate_error`
-# upper limit of h * defect / (tolerance of the velocity), h: step size. The defect is the difference, halfway between
-# two nodes, between the polynomial of the accelerations and the equations. Most of its effect averages out in a step
+ERROR_WEIGHT = 0.5  # the estimated error of a step is multiplied by this factor, see `_estimate_error`
+# a step is rejected if (step size) * defect is larger than this * the tolerance of a velocity. The defect is the
+# deviation of the polynomial of the accelerations from the equations of motion, halfway between two nodes
 ALLOWED_DEFECT = 16.0
 
 
@@ -185,7 +185,7 @@ class CollocationCode:
 
         if self.split_functions is None:
             programs = [*self.equations.accelerations, self.equations.position_projection, self.equations.projection]
-        else:  # long equations are split into several functions: `shared.digest` below covers their other programs
+        else:  # equations are split into several functions: `shared.digest` below covers all programs but this one
             programs = self.equations.accelerations[:1]
         numbers = self.numbers
         description = [[each.sizes, *numbers.structure(each)] for each in programs]
@@ -204,7 +204,7 @@ class CollocationCode:
 
         This code computes accelerations with the fewest operations, and divides by pivots that were chosen before the
         run. After the last sweep, it checks that these pivots are large enough. If not, it solves for the stages again,
-        with the elimination that begins with M; so do STEPS_BY_MASS_FIRST later steps. The arguments are pointers:
+        with the elimination that begins with M; the next STEPS_BY_MASS_FIRST steps use this elimination, too. Pointers:
         `work` to the memory of data/collocation.py, `state` to [q, v, a] before the step, `numbers` to coefficients.
         """
         builder, num = emit.builder, Emitter(emit.builder)
@@ -271,7 +271,7 @@ class CollocationCode:
     def _evaluator(
         self, emit: LaneEmitter, work: Value, state: Value, index: int
     ) -> Callable[[list[Value]], Callable[[], Value]]:
-        """Return the argument `evaluate` of `_iterate`, which writes calls of the program `accelerations[index]`."""
+        """Return `evaluate` for `_iterate`: it writes calls of a function that runs `accelerations[index]`."""
         accelerations = Emitter(emit.builder).pointer(work, self.a_offset)
 
         def evaluate(inputs: list[Value]) -> Callable[[], Value]:
@@ -307,10 +307,10 @@ class CollocationCode:
     def _predict_nodes(self, emit: LaneEmitter, work: Value, state: Value, tolerances: Value) -> None:
         """Write code that stores predicted positions and velocities at the nodes, with which the iteration begins.
 
-        It also stores the fields WEIGHTS, STRICTER, SIZE and POWERS of `work` (data/collocation.py). WEIGHTS are
-        reciprocals of allowed errors, atol + rtol * x: x is |position| (or |velocity|) where the step begins, or its
-        change in half a step if that is larger. If the step size is fixed, nothing is estimated, and these are rtol = 1
-        and atol = min(1, atol / rtol).
+        The code also stores the fields WEIGHTS, STRICTER, SIZE and POWERS of `work` (data/collocation.py). WEIGHTS are
+        reciprocals of allowed errors atol + rtol * x. Here x is |position| (or |velocity|) where the step begins, or
+        its change in half a step if this is larger. If the step size is fixed, 1 and min(1, atol / rtol) replace rtol
+        and atol, because no error of a step is estimated.
         """
         builder, num, n = emit.builder, Emitter(emit.builder), self.n
         has_fixed_size = builder.compare("fcmp oeq", num.load(tolerances, ESTIMATE), llvm_code.ZERO)
@@ -384,8 +384,8 @@ class CollocationCode:
 
         evaluate([times, *positions at the nodes]) writes the part of a sweep that stores the accelerations of the
         coordinates on which accelerations depend. It returns a second function, whose code runs after the last sweep:
-        this code stores the accelerations of the other coordinates, and computes a flag for each lane: 1 if they are
-        finite and pivots are large enough. If a flag is 0, the code that `fallback` writes computes the status instead.
+        this code stores the accelerations of the other coordinates, and computes a flag for each lane: 1 if
+        accelerations are finite and pivots large enough. If a flag is 0, code written by `fallback` yields the status.
         """
         builder, num = emit.builder, Emitter(emit.builder)
 
@@ -449,8 +449,8 @@ class CollocationCode:
     def _repeated(self, emit: LaneEmitter, work: Value, state: Value) -> Iterator[list[Value]]:
         """Return a context manager: code written in its block runs once in a sweep, or twice if the field REPEATS is 1.
 
-        The code computes accelerations from the velocities that the context manager yields: first, velocities of the
-        last sweep; then the integrals of the accelerations just computed, so that the iteration converges faster.
+        The code computes accelerations from the velocities that the context manager yields: in the first pass, those of
+        the last sweep; in the second, integrals of accelerations of the first pass, to converge faster.
         """
         builder, num, first_offset = emit.builder, Emitter(emit.builder), integer(self.v_offset)
         before, loop, repeat, after = builder.block, *(builder.append_block() for _ in range(3))
@@ -467,12 +467,12 @@ class CollocationCode:
             v0, a0 = (num.load(num.pointer(state, i), m * self.n) for m in (1, 2))
             of_v = self._weighted_accelerations(emit, tables().velocities, a0, work, i)
             store_lanes(emit, emit.fma(h, of_v, emit.broadcast(v0)), num.pointer(work, k * LANES), self.spectrum_offset)
-        offset.add_incoming(integer(self.spectrum_offset), builder.block)  # second pass: velocities from here
+        offset.add_incoming(integer(self.spectrum_offset), builder.block)  # the second pass reads velocities here
         builder.jump(loop)
         builder.position_at_end(after)
 
     def _load_iterated(self, emit: LaneEmitter, pointer: Value) -> list[Value]:
-        """Return a vector of values at the nodes for each coordinate: loaded from `pointer` if iterated, else 0."""
+        """Return values at the nodes for each coordinate: loaded from `pointer` if the coordinate is iterated, or 0."""
         values = [emit.constant(0.0)] * self.n
         for k, i in enumerate(self.iterated_coordinates):
             values[i] = load_lanes(emit, pointer, LANES * k)
@@ -481,11 +481,11 @@ class CollocationCode:
     def _estimate_error(self, emit: LaneEmitter, work: Value, state: Value) -> None:
         """Write code that estimates the error of a step whose stages have converged, and what size the next may have.
 
-        It stores ERROR, CURVATURE, FACTOR and FACTOR_OF_ERROR (data/collocation.py). ERROR extrapolates the decay of
-        the Legendre coefficients of the accelerations. With m_k, the largest magnitude of the coefficients of degree k
-        to 8, it is proportional to the larger one of m_7 (m_7 / m_5)^1.5 and m_7^2 / m_3. In 99 % of the steps over
-        corners and peaks of forces, the true error is at most 20 times the estimate. In smooth motion, it is decades
-        smaller. This costs few steps, because the step size depends only on the 12th root of the estimate.
+        The code stores ERROR, CURVATURE, FACTOR and FACTOR_OF_ERROR (data/collocation.py). ERROR extrapolates the decay
+        of the Legendre coefficients of the accelerations. Let m_k be the largest magnitude of the coefficients of
+        degrees k to 8. ERROR is proportional to the larger one of m_7 (m_7 / m_5)^1.5 and m_7^2 / m_3. In 99 % of the
+        steps over corners and peaks of forces, the true error is at most 20 times ERROR. In smooth motion, ERROR is
+        decades too large. This costs few steps, because the step size depends only on the 12th root of ERROR.
         """
         builder, num, n = emit.builder, Emitter(emit.builder), self.n
         n_sweeps, change, target, rho = (num.load(work, i) for i in (mem.SWEEPS, mem.CHANGE, mem.N_TARGET, mem.RHO))
@@ -523,10 +523,10 @@ class CollocationCode:
         num.store(builder.extract(factors, 1), work, mem.FACTOR_OF_ERROR)
 
     def find_defect(self, emit: LaneEmitter, work: Value, state: Value, numbers: Value) -> Value:
-        """Write code for the largest defect at midpoints between nodes, relative to ALLOWED_DEFECT; return its value.
+        """Write code for the largest defect halfway between nodes, relative to the allowed defect; return this ratio.
 
-        The value is INVALID if pivots are too small, or accelerations are not finite. The code also stores
-        FACTOR_OF_DEFECT, the largest ratio of the next step size to this one that the defect allows.
+        The result is INVALID if pivots are too small, or accelerations are not finite. The code also stores
+        FACTOR_OF_DEFECT, the largest ratio of the next step size to the present one that the defect allows.
         """
         builder, num, n = emit.builder, Emitter(emit.builder), self.n
         emit.numbers = emit.constants = numbers
@@ -573,7 +573,7 @@ class CollocationCode:
     def end_step(self, emit: LaneEmitter, work: Value, state: Value, new_state: Value) -> None:
         """Write code that stores [q, v, a] at the end of the step in `new_state`.
 
-        To predict the next step, it also stores the polynomial of the accelerations and, as NEXT_DEGREE, its degree.
+        The code also stores the polynomial of the accelerations that will predict the next step, and NEXT_DEGREE.
         """
         builder, num, n = emit.builder, Emitter(emit.builder), self.n
         last, h = LANES - 1, num.load(work, mem.H)
@@ -621,8 +621,8 @@ class CollocationCode:
         """Write code that stores NEXT_DEGREE, the degree of the polynomial that predicts the next step.
 
         `max_error`: in lane k, the error that a prediction of degree k + 1 would have had at the end of this step.
-        NEXT_DEGREE is the lowest degree whose error is at most 1.2 times the smallest one, but at least 2, and changed
-        by at most 2 from step to step. If no polynomial predicted this step, NEXT_DEGREE is FIRST_DEGREE.
+        NEXT_DEGREE is the lowest degree whose error is at most 1.2 times the smallest error. NEXT_DEGREE is at least 2,
+        and changes by at most 2 in a step. If no polynomial predicted this step, NEXT_DEGREE is FIRST_DEGREE.
         """
         builder, num = emit.builder, Emitter(emit.builder)
         least = -emit.max_over_lanes(-max_error)
@@ -637,7 +637,7 @@ class CollocationCode:
         num.store(builder.select(predicts, degree, constant(DOUBLE, FIRST_DEGREE)), work, mem.NEXT_DEGREE)
 
     def project_positions(self, emit: LaneEmitter, work: Value, numbers: Value) -> None:
-        """Write code for one Newton step towards C = 0, from the positions at the ends of eight steps at once."""
+        """Write code for one Newton step towards the constraints C = 0, at the ends of eight steps at once."""
         if self.split_functions is None:
             self._project(emit, work, numbers, self.equations.position_projection)
         else:
@@ -665,7 +665,7 @@ class CollocationCode:
     def _project_in_parts(
         self, emit: LaneEmitter, work: Value, numbers: Value, write: Callable[..., Value], names: tuple[str, ...]
     ) -> None:
-        """Do the same as `_project` for equations split into several functions: `write` writes calls of these."""
+        """Write code as `_project` does, but by `write`, which writes calls of functions for parts of the equations."""
         num, moved = Emitter(emit.builder), emit.builder.allocate(DOUBLE, LANES * self.n)
         indices = {name: num.pointer(work, index) for name, index in self._end_offsets().items()} | {"moved": moved}
         state = load_lanes(emit, work, self.end_offset), indices["q"], indices["v"]
@@ -673,7 +673,7 @@ class CollocationCode:
         self._store_largest_move(emit, work, [load_lanes(emit, moved, LANES * k) for k in range(self.n)], is_valid)
 
     def _end_offsets(self) -> dict[str, int]:
-        """Return where arrays for the ends of eight steps begin in `work`; keys: "q", "v", "a" and "lam"."""
+        """Return offsets in `work` of the arrays for the ends of eight steps; keys: "q", "v", "a" and "lam"."""
         return {
             "q": self.end_offset + LANES,
             "v": self.end_offset + LANES * (1 + self.n),
@@ -690,7 +690,7 @@ class CollocationCode:
         store_lanes(emit, emit.builder.select(is_valid, before, emit.constant(0.0)), work, mem.VALID)
 
     def _integrate(self, emit: LaneEmitter, work: Value, state: Value) -> Value:
-        """Write code that integrates accelerations to v and q at the nodes; return max |change of v| / tolerance."""
+        """Write code that integrates accelerations to new v and q; return the largest |change of v| / tolerance."""
         num = Emitter(emit.builder)
         with loop_over_coordinates(emit, self.iterated_coordinates, [emit.constant(0.0)]) as (k, i, (largest,), new):
             before = load_lanes(emit, num.pointer(work, k * LANES), self.v_offset)
@@ -705,7 +705,7 @@ class CollocationCode:
     def _store_stages(
         self, emit: LaneEmitter, work: Value, state: Value, k: Value, i: Value, sums: Sequence[Value]
     ) -> Value:
-        """Write code for v and q of the k-th iterated coordinate, i; return v. `sums`: integrals of accelerations."""
+        """Write code that stores q and v of coordinate i, the k-th iterated one; return v. `sums`: integrals of a."""
         num = Emitter(emit.builder)
         h = emit.broadcast(num.load(work, mem.H))
         index, begin = num.pointer(work, k * LANES), num.pointer(state, i)
@@ -729,14 +729,14 @@ class CollocationCode:
         return self._weighted_sum(emit, table, self._node_accelerations(emit, first, work, i))
 
     def _weighted_sum(self, emit: LaneEmitter, table: Array, terms: Sequence[Value]) -> Value:
-        """Return `terms @ table`; its terms are added up in two sums, which do not wait for each other."""
+        """Return `terms @ table`, computed as two sums of products that the processor computes in parallel."""
         sums = [emit.broadcast(x) * constants(row) for x, row in zip(terms[:2], table[:2], strict=True)]
         for k, (x, row) in enumerate(zip(terms[2:], table[2:], strict=True)):
             sums[(k + 1) % 2] = emit.fma(emit.broadcast(x), constants(row), sums[(k + 1) % 2])
         return emit.add_sums(*sums)
 
     def _polynomial_pointer(self, emit: LaneEmitter, work: Value, is_next: bool) -> Value:
-        """Return a pointer to the polynomial that predicts this step or, if `is_next`, the next step."""
+        """Return a pointer to the polynomial that predicts the next step if `is_next`, otherwise this step."""
         builder, num = emit.builder, Emitter(emit.builder)
         second = builder.compare("fcmp one" if not is_next else "fcmp oeq", num.load(work, mem.CURRENT), llvm_code.ZERO)
         size = LANES * len(self.iterated_coordinates)
@@ -749,7 +749,7 @@ class Collocation(NamedTuple):
 
     functions: DeferredFunctions
     code: CollocationCode
-    numbers: Any  # coefficients: their values or, in the object cached for all systems, expressions in the parameters
+    numbers: Any  # values of coefficients; in the object cached for all systems: expressions in the parameters
 
 
 def compiled_collocation(generated: GeneratedCode) -> Collocation:

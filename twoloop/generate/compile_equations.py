@@ -4,7 +4,7 @@ The operations of an elimination become LLVM instructions one by one, without nu
 hundred operations. The code is cached on disk, like the code of the kernels.
 
 **Accelerations** are computed by one of two programs. The program with the fewest operations (null_space.py) divides by
-pivots that are chosen before the run. If one of them is small, another function of the LLVM module computes the
+pivots that are chosen before the run. If one of these pivots is small, another function of the LLVM module computes the
 accelerations, by an elimination that begins with the mass matrix M. In SIMD lanes, this function is called for all
 lanes if one lane needs it; the other lanes keep their results, so that no run depends on the runs in other lanes.
 
@@ -39,13 +39,13 @@ DOUBLE_POINTER = f"{DOUBLE}*"
 # generated code is not used if the relative error of its accelerations near the start is larger. This is checked only
 # if rows of G are added to M, or solutions are refined (see PivotChoice). During runs, the error grew up to 200 times
 LARGEST_LOSS = 1e-8
-MAX_POSITIONS, SPACING = 4, 0.02  # largest number of positions tried to measure this error; their spacing (m or rad)
+MAX_POSITIONS, SPACING = 4, 0.02  # this error is measured at the first of 4 positions, 0.02 apart, with large pivots
 
 
 def write_accelerations(
     emit: Emitter, equations: Elimination, inputs: Sequence[Value], numbers: Coefficients
 ) -> tuple[list[Value], Value]:
-    """Write code for the accelerations at `inputs`, [t, q, v]; return them and a flag: 1 if pivots are large enough.
+    """Write code for accelerations at `inputs`, [t, q, v]. Return the accelerations and a flag: 1 if they are valid.
 
     `numbers`: the coefficients and their indices in an array; `emit` must have pointers to this array.
     """
@@ -67,7 +67,8 @@ def write_acceleration_function(
 ) -> None:
     """Write the LLVM function `name`, which computes accelerations from t, q, v and the coefficients.
 
-    If they are valid, it stores them in its last argument and returns 1; else 0. `kind`: types of result and arguments.
+    If the accelerations are valid, the function stores them in its last argument and returns 1; otherwise, it returns
+    0. `kind`: types of its result and of its arguments.
     """
 
     def emit_all(emit: Emitter, t: Value, q: Value, v: Value, coefficients: Value, out: Value) -> Value:
@@ -90,10 +91,10 @@ def _store_if_valid(emit: Emitter, is_valid: Value, pointers: Sequence[Value], a
 def call_accelerations(
     emit: Emitter, equations: Elimination, index: int, inputs: Sequence[Value], numbers: Coefficients, out: Value
 ) -> Value:
-    """Write a call of a function that computes accelerations at `inputs`, [t, q, v]; return its flag: 1 if valid.
+    """Write a call of a function that stores the accelerations at `inputs`, [t, q, v], in `out`; return its flag.
 
-    The function stores them in `out`. `index`: 0 for the program with the fewest operations, -1 for the elimination
-    that begins with M. `numbers`: the coefficients and their indices in an array.
+    The flag is 1 if the accelerations are valid. `index`: 0 for the program with the fewest operations, -1 for the
+    elimination that begins with M. `numbers`: the coefficients and their indices in an array.
     """
     state = _stack_array(emit, 2 * equations.system.n_q)
     for i, value in enumerate(inputs[1:]):
@@ -163,7 +164,7 @@ def _acceleration_function(emit: Emitter, equations: Elimination, index: int, nu
 
 
 def _coefficient_pointers(emit: Emitter) -> list[Value]:
-    """Return pointers to the coefficients: in SIMD lanes, two, to those that differ between lanes and to the others."""
+    """Return one pointer to all coefficients; or, in SIMD lanes, two: to those that vary between lanes, and others."""
     constants = getattr(emit, "constants", None)
     return [emit.numbers] if constants is None else [emit.numbers, constants]
 
@@ -172,19 +173,19 @@ def _stack_array(emit: Emitter, size: int) -> Value:
     return emit.builder.allocate(DOUBLE, size * width_of(emit.double_type))
 
 
-# equations with more operations than this are split into functions. If null_space.py yields a short program for the
-# accelerations, the limit is SPLIT_PROJECTIONS, and only projections are split: this halves the compile time. If not,
-# the limit is SPLIT_ALL, and projections and accelerations are split: this makes accelerations 50 % slower
+# equations with more than a limit of operations are split into functions. If null_space.py yields a short program for
+# the accelerations, the limit is SPLIT_PROJECTIONS, and only projections are split: this halves the compile time. If
+# not, the limit is SPLIT_ALL, and accelerations are split, too: this makes them 50 % slower
 SPLIT_PROJECTIONS, SPLIT_ALL = 200, 500
 
 
 class SplitFunctions:
     """Generator that splits long equations into parts: LLVM functions, called for accelerations and for projections.
 
-    The part "factors" factorizes the matrix of M a + G^T lam = r, G a = c, and stores what the other parts need.
-    solution : programs for these factors and for the solution.
+    The part "factors" factorizes the matrix [M G^T; G 0] of M a + G^T lam = r, G a = c, and stores the factors.
+    solution : programs that compute the factors and the solution.
     position_programs : programs of parts that compute right-hand sides r and c from t, q and v; keys: names of parts.
-    solution_programs : programs of parts that solve for r and c with the stored factors; keys: names of parts.
+    solution_programs : programs of parts that solve for a and lam with the stored factors; keys: names of parts.
     """
 
     def __init__(self, equations: Elimination, numbers: Coefficients):
@@ -227,7 +228,7 @@ class SplitFunctions:
         return list(functions)
 
     def _call(self, emit: Emitter, *calls: tuple[str, Sequence[Value]]) -> Value:
-        """Write calls, given as (part, arguments), and the parts that are missing; return a flag: 1 if all return 1."""
+        """Write calls of parts, given as (name, arguments), and missing parts; return a flag: 1 if all are valid."""
         module, all_valid = emit.builder.module, None
         for part, arguments in calls:
             name = f"{part}_{emit.suffix}"
@@ -240,7 +241,7 @@ class SplitFunctions:
         return all_valid
 
     def _lowering(self, emit: Emitter, graph: Graph, args: Sequence[Value], stored: Mapping[int, Location]) -> Lowering:
-        """Return a Lowering that writes the code of a part. `args`: three inputs, pointer to coefficients, others."""
+        """Return a Lowering for the code of a part; `args` begin with three inputs and a pointer to coefficients."""
         *inputs, emit.numbers = args[:4]
         if width_of(emit.double_type) > 1:
             emit.constants = emit.numbers  # type: ignore[attr-defined]  # the coefficients are the same in all lanes
@@ -249,7 +250,7 @@ class SplitFunctions:
         return lowering
 
     def _write_factors(self, emit: Emitter, *arguments: Value) -> Value:
-        """Write the part "factors", which stores in `arguments[4]`; return a flag: 1 if pivots are large enough."""
+        """Write the part "factors", which stores factors in `arguments[4]`; return a flag: 1 if pivots are large."""
         graph, solution, stored = self.equations.graph, self.solution, arguments[4]
         lowering = self._lowering(emit, graph, arguments, {})
         locations = {i: (stored, index) for i, index in solution.stored_indices.items()}
@@ -260,7 +261,10 @@ class SplitFunctions:
         return lowering.is_valid(solution.factor_program, [])
 
     def _write_part(self, program: Program, stored: Mapping[int, int], emit: Emitter, *arguments: Value) -> Value:
-        """Write a part that runs `program`; return a flag: 1 if valid. `stored`: where to load quantities from."""
+        """Write a part that runs `program`; return a flag: 1 if its results are valid.
+
+        The part loads the quantities in `stored` instead of computing them; values: indices in `arguments[4]`.
+        """
         locations = {i: (arguments[4], index) for i, index in stored.items()}
         lowering = self._lowering(emit, program.graph, arguments, locations)
         results = program.run(lowering)
@@ -268,8 +272,6 @@ class SplitFunctions:
             for j, value in enumerate(values):
                 emit.store(value, array, j)
         return lowering.is_valid(program, results[0])
-
-    # methods that other classes also call; arguments: emitter, time t, then pointers (`numbers`: to the coefficients)
 
     def accelerations(self, emit: Emitter, t: Value, q: Value, v: Value, numbers: Value, a: Value) -> Value:
         """Write code that stores the accelerations at (t, q, v) in `a`; return a flag: 1 if they are valid."""
@@ -282,9 +284,9 @@ class SplitFunctions:
     def project_position(
         self, emit: Emitter, t: Value, q: Value, v: Value, numbers: Value, moved: Value, out: Value
     ) -> Value:
-        """Write code for a Newton step towards C = 0; return a flag: 1 if its result is valid.
+        """Write code for a Newton step of q towards the constraints C = 0; return a flag: 1 if the result is valid.
 
-        The code stores the corrected q in `out`, and its change in `moved`. `numbers`: pointer to the coefficients.
+        The code stores the corrected q in `out`, and the change of q in `moved`. `numbers`: pointer to coefficients.
         """
         stored, r, c, lam = self._stack_arrays(emit)
         inputs = [t, q, v, numbers, stored]
@@ -341,13 +343,13 @@ class SplitFunctions:
         return is_valid
 
     def _stack_arrays(self, emit: Emitter) -> list[Value]:
-        """Return pointers to new arrays: for stored quantities; right-hand sides r and c; a change of v, or lam."""
+        """Return pointers to four arrays: of stored quantities; r and c (right-hand sides); changes of v, or lam."""
         sizes = self.solution.n_stored, self.n, self.n_rows, max(self.n, self.n_rows)
         return [_stack_array(emit, size) for size in sizes]
 
 
 def _write_return_unless(emit: Emitter, is_valid: Value) -> None:
-    """Write code that returns false from the function if the bit `is_valid` is 0; if it is a vector, write nothing."""
+    """Write code that returns false from the function if the bit `is_valid` is 0; in SIMD lanes, write nothing."""
     if is_valid.type == BIT:
         emit.builder.return_false_unless(is_valid)
 
@@ -369,10 +371,10 @@ Array = NDArray[np.float64]
 def write_function(
     module: Module, name: str, kind: tuple[str, list[str]], program: Program, numbers: Coefficients
 ) -> None:
-    """Write the LLVM function `name` (types: `kind`), which computes the arrays of a program from its inputs.
+    """Write the LLVM function `name`, which computes the arrays of a program from its inputs.
 
     If the program's conditions hold and its first array is finite, the function stores the arrays and returns true;
-    else it stores nothing and returns false.
+    else it stores nothing and returns false. `kind`: types of its result and arguments.
     """
 
     def emit_all(emit: Emitter, *arguments: Value) -> Value:
@@ -410,7 +412,7 @@ class SharedCode:
         self.functions = generated_functions("equations", _stamp(), self.digest, self._module_text, optimise=False)
 
     def specialize(self, system: ConstrainedSystem, evaluate: Evaluator) -> "GeneratedCode":
-        """Return this code with the coefficients for `system`; `evaluate` computes them from its parameters."""
+        """Return this code with the coefficients for `system`; `evaluate` computes coefficients from parameters."""
         return GeneratedCode(
             self, evaluate(self.numbers.formulas), self.equations.traced.specialize(system, evaluate), evaluate
         )
@@ -460,16 +462,16 @@ class GeneratedCode(NamedTuple):
 
 
 def _choice_at(system: ConstrainedSystem, t: float, q: Array) -> PivotChoice:
-    """Return the choice of rows and pivots for the elimination at a position; the last one is cached."""
+    """Return the choice of rows and pivots for the elimination at time t and position q; cache the last choice."""
     choice: PivotChoice
     choice = system.remembered_at("choice", (t, q.tobytes()), lambda: PivotChoice.choose(system, t, q))
     return choice
 
 
 def generated_code(system: ConstrainedSystem, t0: float, q0: Array, check: Check = accept_traces) -> GeneratedCode:
-    """Return generated code for a start (t0, q0), cached or new; `check` raises Untraceable if traces are wrong.
+    """Return generated code for a run from (t0, q0), from the cache if possible; else generate the code.
 
-    Raise ValueError if code for the equations cannot be generated.
+    `check` raises Untraceable if traces are wrong. Raise ValueError if code cannot be generated.
     """
     try:
         choice = _choice_at(system, t0, q0)
@@ -486,10 +488,10 @@ def generated_code(system: ConstrainedSystem, t0: float, q0: Array, check: Check
 
 
 def _relative_error(code: GeneratedCode, system: ConstrainedSystem, t0: float, q0: Array) -> float:
-    """Return the relative error of accelerations by generated code, at rest, at the start (t0, q0) or near it.
+    """Return the relative error of accelerations by generated code, for velocities 0, at or near the start (t0, q0).
 
-    At most MAX_POSITIONS positions are tried until pivots are large enough; if they never are, return infinity. Two
-    generated functions compute accelerations, one of them after a projection: return the larger one of their errors.
+    At most MAX_POSITIONS positions are tried until pivots are large enough; if no position has such pivots, return
+    infinity. Two generated functions compute accelerations, one after a projection: return the larger error.
     """
     rows, n = list(code.shared.equations.choice.rows), system.n_q
     v, a, reduced, lam = np.zeros(n), np.empty(n), np.empty(n), np.empty(system.n_c + system.n_a)
@@ -510,7 +512,7 @@ def _relative_error(code: GeneratedCode, system: ConstrainedSystem, t0: float, q
         right, exact = np.concatenate([force, gamma[rows]]), np.zeros(n + len(rows))
         for _ in range(3):  # the first pass solves, the others refine the solution
             exact += np.linalg.solve(matrix, right - matrix @ exact)
-    except ValueError:  # no exact solution: gamma is by differences, forces are undefined, or the matrix is singular
+    except ValueError:  # gamma is not exact (by differences), forces are undefined, or the matrix is singular
         return 0.0
     heavy = mass.diagonal() > 0.0
     size = max(np.abs(exact[:n]).max(), np.abs(force[heavy] / mass.diagonal()[heavy]).max(initial=0.0))

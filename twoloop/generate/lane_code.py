@@ -47,14 +47,13 @@ from twoloop.kernels.lanes import layout as lanes
 from twoloop.kernels.lanes.layout import CODE
 from twoloop.problem.system import ConstrainedSystem
 
-# constants of Taylor steps, as in kernels/steps/taylor_step.py
-# if a step is rejected because the projection changes q by more than a limit, a shorter step is to change q by this *
-# the limit
+# if a Taylor step is rejected because the projection changes q by more than a limit, the next step is so much shorter
+# that its projection is expected to change q by this * the limit (the same as in kernels/steps/taylor_step.py)
 TARGET_ERROR = 0.3
 MIN_FACTOR, SAFETY, MAX_FACTOR = 0.1, 0.9, 5.0  # smallest ratio of successive step sizes, safety factor, largest ratio
 MAX_REJECTIONS = 10  # a run with more successive rejected steps than this is repeated outside the lanes
 FIRST_UNIT = 0.01  # unit of time of the first series of a run, relative to the duration t1 - t0 of the run
-# a projection has converged if a correction is at most ABSOLUTE_CORRECTION (unit of q) or RELATIVE_CORRECTION * max|q|
+# a projection has converged if it changes q by at most ABSOLUTE_CORRECTION (unit of q) or RELATIVE_CORRECTION * max|q|
 ABSOLUTE_CORRECTION, RELATIVE_CORRECTION = 1e-14, 1e-14
 CONTRACTION = 0.5  # a projection fails if the ratio of a correction to the previous correction is above this
 N_PARALLEL = 3  # number of coordinates whose series one loop evaluates: each needs 3 of the 16 vector registers
@@ -89,7 +88,7 @@ class LaneSteps:
         self.n, self.n_rows = n, n_rows
 
     def update_unit(self, emit: LaneEmitter, control: Value, work: Value) -> Value:
-        """Write code that stores UNIT (s), the unit of time of the series: the step size by the last one; return it."""
+        """Write code that stores UNIT, the series' unit of time: the step size (s) that the last series allows."""
         select, unit = emit.builder.select, emit.load(work, lanes.UNIT)
         is_fresh, is_accepted = (is_set(emit, work, field) for field in (lanes.IS_NEW, lanes.ACCEPTED))
         duration = broadcast_entry(emit, control, lanes.T1) - broadcast_entry(emit, control, lanes.T0)
@@ -138,7 +137,7 @@ class LaneSteps:
             store_mask(emit, work, field, is_continued)
 
     def evaluate_series(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Write code that evaluates the series at the end of the step, and stores NEW; its q is also `predicted`."""
+        """Write code that stores NEW, the state by the series at the end of the step, and its positions `predicted`."""
         memory = self.memory(emit, order, control, work)
         for j, q in enumerate(self.evaluate_positions(emit, memory, emit.load(work, lanes.X))):
             emit.store(q, memory.predicted, j)
@@ -176,7 +175,7 @@ class LaneSteps:
         emit.store(self.compute_defect(emit, control, memory, a), work, lanes.DEFECT)
 
     def compute_defect(self, emit: LaneEmitter, control: Value, memory: LaneMemory, a: list[Value]) -> Value:
-        """Write code for the defect of the Taylor series at the state NEW, relative to the allowed defect; return it.
+        """Return the defect of the Taylor series at the state NEW, relative to the allowed defect.
 
         The defect is the difference between accelerations by the series and `a`, accelerations by the equations.
         """
@@ -196,7 +195,7 @@ class LaneSteps:
         return duration * max_defect
 
     def compute_prediction_error(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Write code that stores PREDICTION_ERROR, the change of q by the projection, relative to its limit."""
+        """Write code that stores PREDICTION_ERROR: the change of q by the projection / the allowed change."""
         n, memory, (rtol, atol) = self.n, self.memory(emit, order, control, work), self.tolerances(emit, control)
         h = emit.load(work, lanes.H)
 
@@ -223,11 +222,11 @@ class LaneSteps:
         emit.store(error, work, lanes.PREDICTION_ERROR)
 
     def crossing_mask(self, emit: LaneEmitter, memory: LaneMemory) -> Value | None:
-        """Write code for a mask of lanes whose step may have passed a singular position; return it. None: no check."""
+        """Return a mask of the lanes whose step may have passed a singular position; None if this is not checked."""
         return None
 
     def accept_or_reject(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Write code that accepts steps (ACCEPTED = 1) or rejects them, and stores the largest next size, LONGEST.
+        """Write code that accepts steps (ACCEPTED = 1) or rejects them, and limits the next step size to LONGEST.
 
         After too many rejections or a value that is not finite, a run leaves its lane: RUNNING = 0.
         """
@@ -277,7 +276,7 @@ class LaneSteps:
         return broadcast_entry(emit, control, lanes.RTOL), atol
 
     def memory(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> LaneMemory:
-        """Return the LaneMemory for `work`; give `emit` the pointers to the coefficients."""
+        """Return the LaneMemory for `work`; also set the pointers of `emit` to the coefficients."""
         *fixed, series = lanes.array_offsets(self.n, self.n_rows, self.n_numbers)
         emit.numbers = emit.pointer(work, fixed.pop())
         emit.constants = emit.builder.advance(control, integer(lanes.ATOL + self.n))
@@ -316,12 +315,12 @@ SparseRows = list[dict[int, Value]]  # the nonzero entries of each row, by colum
 
 
 def orientation_change_mask(emit: LaneEmitter, before: SparseRows, after: SparseRows) -> Value:
-    """Write code for a mask of lanes whose step may have passed a singular position, as det G1 G0^T <= 0; return it.
+    """Return a mask of the lanes whose step may have passed a singular position, because det(G1 G0^T) <= 0.
 
     G0 (`before`) and G1 (`after`) are the rows of the constraints at both ends of the step. By the Cauchy-Binet
-    formula, the determinant is the inner product of the vectors of maximal minors of G0 and G1. It is positive if these
-    vectors are similar. A step through a position at which the rows become dependent may lead to another assembly: then
-    all minors pass through zero and change their signs. A lane with a zero pivot is in the mask, too.
+    formula, the determinant is the inner product of the vectors of maximal minors of G0 and G1. If these vectors are
+    similar, the determinant is positive. A step through a position at which the rows become dependent may lead to
+    another assembly: then all minors change their signs. Lanes in which a pivot of G1 G0^T is zero are masked, too.
     """
     matrix: list[dict[int, Value]] = [{} for _ in before]
     for i, row in enumerate(after):
@@ -376,7 +375,7 @@ class LaneStages:
         return [np.asarray(each).tobytes() for each in self.tableau]
 
     def write(self, emit: LaneEmitter, arguments: tuple[Value, Value, Value], memory: LaneMemory) -> None:
-        """Write code that stores NEW, the state at X (s) after the step began, and ERROR, which is valid if X = H."""
+        """Write code that stores NEW, the state X (s) after the step began; ERROR is valid if X is the step size H."""
         A, b, c, fine_weights, coarse_weights = self.tableau
         _, control, work = arguments
         x, t = emit.load(work, lanes.X), emit.load(work, lanes.T)
@@ -424,12 +423,12 @@ class _Coordinate:
         self.old_state = tuple(emit.load(series_pointer, lanes.BEGIN * n + index) for index in (0, n))
         self._acceleration_locations = [(series_pointer, (lanes.SLOPES + k) * n) for k in range(count)]
         self._loaded: dict[int, Value] = {}
-        if count > 1:  # the acceleration of the last stage was just computed, and is not in memory yet
+        if count > 1:  # the acceleration of the last stage is new: move it from `a` to those of all stages
             self._loaded[count - 1] = emit.load(emit.pointer(memory.a, j))
             emit.store(self._loaded[count - 1], *self._acceleration_locations[count - 1])
 
     def sum(self, weights: Array) -> Value:
-        """Return the sum over the stages of the acceleration times its weight."""
+        """Return the sum of the accelerations at all stages, multiplied by weights."""
         total: Value | None = None
         for k, weight in enumerate(weights.tolist()):
             if abs(weight) > WEIGHT_ROUNDING:
@@ -446,7 +445,7 @@ class _Coordinate:
         return 1.0 / (atol + rtol * magnitude)
 
     def store_state(self, weights: Array, position_weights: Array, x: Value) -> tuple[Value, Value]:
-        """Write code that stores q and v at a stage in NEW; return both. `weights`: of accelerations in v."""
+        """Write code that stores q and v of a stage in NEW; return both. Accelerations have `weights` in v."""
         emit, (q, v) = self.emit, self.old_state
         drift = float(weights.sum()) * v
         q = q + x * (drift + x * self.sum(position_weights))
@@ -457,7 +456,7 @@ class _Coordinate:
 
 
 GOLDEN_SECTION = 0.6180339887498949  # the multiples of this number, modulo 1, are spread evenly on [0, 1]
-MAX_PARTS = 1000.0  # largest number of equal parts of a step, between which the defect is evaluated
+MAX_PARTS = 1000.0  # a step is divided into at most this number of equal parts, between which defects are evaluated
 MAX_SERIES_OPERATIONS = 1500  # no code is generated for series with more operations; to compile 1500 takes some seconds
 
 
@@ -495,7 +494,7 @@ class LaneCode(LaneSteps):
         self._row_program = Program(equations.graph, {"G": [rows[k, j] for k, j in self._row_entries]})
         programs = [*equations.accelerations, equations.position_projection, equations.basic_projection]
         programs += [equations.redundant_rows, *([self.solution.factor_program] if series else [])]
-        # `_structure` assigns array indices to coefficients, which are needed even if the code is read from the disk
+        # `_structure` also assigns array indices to coefficients: the kernels need these even if the code is cached
         self.structure = self._structure(programs if series else [*programs, self._row_program])
         self.n_numbers = self.numbers.n_varying
         programs += [self.solution.solution_program] if series else []
@@ -527,7 +526,7 @@ class LaneCode(LaneSteps):
         return hashlib.sha256(repr(description).encode()).hexdigest()
 
     def compute_series(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Write code for the Taylor coefficients of q(t) from STATE on in each lane, with UNIT as unit of time."""
+        """Write code that stores the Taylor coefficients of q(t) in each lane, from STATE on; unit of time: UNIT."""
         builder, n, memory = emit.builder, self.n, self.memory(emit, order, control, work)
         unit, out, scratch = self.update_unit(emit, control, work), memory.series, memory.scratch
         inputs = [emit.load(work, lanes.T), *(emit.load(memory.state, i) for i in range(2 * n))]
@@ -551,8 +550,8 @@ class LaneCode(LaneSteps):
     def check_defect_within(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
         """Write code that stores WORST_DEFECT, the largest defect at several times within the step.
 
-        The times are equidistant, at most GAP (s) apart. They lie differently in each step: SHIFT, a multiple of the
-        golden section modulo 1, moves them as far as GAP allows. Finally, T_NEW is the time at the end of the step.
+        The times are equidistant, at most GAP (s) apart. In each step, the times are moved by another fraction SHIFT of
+        the distance that GAP allows. Finally, T_NEW is the time at the end of the step.
         """
         builder, memory = emit.builder, self.memory(emit, order, control, work)
         h, gap = emit.load(work, lanes.H), broadcast_entry(emit, control, lanes.GAP)
@@ -580,7 +579,7 @@ class LaneCode(LaneSteps):
         emit.store(builder.select(is_last, t1, t + h), work, lanes.T_NEW)
 
     def correct_positions(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Write code for a Newton step of q in NEW where ACTIVE is 1; then ACTIVE = UNCONVERGED = 1 (valid) or 0."""
+        """Write code for a Newton step of q in NEW where ACTIVE = 1; set ACTIVE = UNCONVERGED = 1 if valid, else 0."""
         is_active, _ = self._project(
             emit, self.equations.position_projection, lanes.ACTIVE, self.memory(emit, order, control, work)
         )
@@ -643,7 +642,7 @@ class LaneCode(LaneSteps):
         return is_valid, a
 
     def crossing_mask(self, emit: LaneEmitter, memory: LaneMemory) -> Value | None:
-        """Return the result of `orientation_change_mask`; None for Taylor steps: defects show singular positions."""
+        """Return the mask of `orientation_change_mask`; None for Taylor steps, where defects show singularities."""
         if self.recurrences is not None or len(self.equations.rows) == 0:
             return None
         ends_of_step = (lanes.T, memory.state), (lanes.T_NEW, memory.new)
@@ -711,8 +710,8 @@ class LaneConstraints(LaneSteps):
 
 
 SECONDS_PER_QUANTITY = 3e-4  # estimated time (s) to compile one operation
-# modules that write code: after a change of one of them, code in the cache on the disk is not used any more
-ELIMINATION_MODULES = (elimination, null_space, compile_equations)  # they write code that computes accelerations
+# modules that write code: after a change of such a module, code in the cache on the disk is not used any more
+ELIMINATION_MODULES = (elimination, null_space, compile_equations)  # modules that write code for accelerations
 CODE_MODULES = (series, *ELIMINATION_MODULES, program, lane_series, llvm_code, llvm_text)
 
 Code = TypeVar("Code", LaneCode, LaneConstraints)

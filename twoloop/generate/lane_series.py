@@ -32,7 +32,7 @@ from twoloop.kernels.lanes.layout import LANES
 # [-1/2, 1/2], with an error of 1e-07; both were fitted by least squares. Step-size control needs no better accuracy
 LOG2_COEFFICIENTS = (-3.03460285, 6.089895763, -5.301709109, 3.249466561, -1.247962495, 0.2700374574, -0.02512320329)
 EXP2_COEFFICIENTS = (1.000000075, 0.6931472067, 0.2402210736, 0.05550327214, 0.009676037098, 0.001340043216)
-# to avoid overflow, `exponential` limits x to +-MAX_EXPONENT, and `logarithm` raises smaller x to MIN_ARGUMENT
+# to avoid overflow, `exponential` clips x to +-MAX_EXPONENT, and `logarithm` replaces x below MIN_ARGUMENT by it
 MAX_EXPONENT, MIN_ARGUMENT = 1000.0, 1e-300
 
 
@@ -45,7 +45,7 @@ class LaneEmitter(Emitter):
         super().__init__(builder, lanes)
 
     def coefficient(self, number: float) -> Value:
-        """Return `number` in all lanes; load a Coefficient: a vector if it varies between lanes, else a number."""
+        """Return `number` in all lanes. Load a Coefficient: a vector if it varies between lanes, else one number."""
         if not isinstance(number, Coefficient) or number.varies:
             return super().coefficient(number)
         pointer = self.builder.advance(self.constants, integer(number.index))
@@ -102,7 +102,7 @@ class LaneEmitter(Emitter):
 def load_lanes(emit: LaneEmitter, base: Value, index: int = 0) -> Value:
     """Return the vector base[index : index + STAGES]: one number for each stage of a collocation step.
 
-    Its address must be aligned to the size of the vector. Loading is slow if the numbers have just been stored one by
+    The address must be aligned to the size of the vector. Loading is slow if the numbers have just been stored one by
     one: the processor waits until all are stored.
     """
     start, kind = emit.builder.advance(base, integer(index)), vector_of(DOUBLE, STAGES)
@@ -141,7 +141,7 @@ def gather_lane(emit: LaneEmitter, vectors: Sequence[Value], lane: int) -> Value
 def loop_over_coordinates(
     emit: LaneEmitter, coordinates: Sequence[int], carried: Sequence[Value] = ()
 ) -> Iterator[tuple[Value, Value, list[Any], list[Any]]]:
-    """Return a context manager that writes a loop over k, as `Emitter.loop` does, and also yields coordinates[k]."""
+    """Return a context manager that writes a loop over k, as `Emitter.loop` does, but also yields coordinates[k]."""
     builder = emit.builder
     table = None if list(coordinates) == list(range(len(coordinates))) else builder.module.add_table(coordinates)
     with emit.loop(integer(0), integer(len(coordinates)), carried) as (k, values, new):
@@ -150,7 +150,7 @@ def loop_over_coordinates(
 
 
 ZERO_ROW = -1  # index of a row of zeros in memory; rows 0, 1, ... contain the coefficients of order 0, 1, ...
-# largest number of sums that one loop adds up: each needs a register, and there are 32 of eight doubles, or 16 of four
+# largest number of sums in one loop: each sum needs a register; processors have 32 of eight doubles, or 16 of four
 MAX_SUMS_IN_LOOP = 12 if LANES == 8 else 6
 
 
@@ -158,7 +158,7 @@ class Operation(NamedTuple):
     """Operation on Taylor series; the sine and the cosine of an angle are one operation with two results."""
 
     kind: int  # such as PRODUCT, see kernels/evaluation/operations.py
-    results: tuple[int, ...]  # indices of its results among all quantities
+    results: tuple[int, ...]  # indices of the results of this operation among all quantities
     first: tuple[Terms, float]  # terms and constant of the first argument
     second: tuple[Terms, float]  # terms and constant of the second argument
 
@@ -183,7 +183,7 @@ class LaneSeries:
         self.late = self._make_operations(program.late, first_result + len(program.early.first.column))
         self.rows = self._row_expressions(program.rows, program.row_indices)
         self.balance = self._row_expressions(program.balance, program.balance_indices)
-        # the result of `_shared_sums`; it is empty at first, because `_shared_sums` calls `_factors`, which reads it
+        # this dict is empty at first, because `_shared_sums`, which fills it, calls `_factors`, which reads it
         self._carried_sums: dict[int, tuple[int, int]] = {}
         self._carried_sums |= self._shared_sums()
         self.carried_pairs = sorted(set(self._carried_sums.values()))
@@ -208,7 +208,7 @@ class LaneSeries:
         return [self.n, self.n_rows, self.early, self.late, self.rows, self.balance, self.factor_indices]
 
     def _expressions(self, sums: Sums, rows: Sequence[int]) -> list[tuple[Terms, float]]:
-        """Return (terms, constant) of each expression k in `sums`, which has the index rows[k] in `sums.row`."""
+        """Return (terms, constant) of each expression in `sums`; `rows`: numbers by which `sums.row` names them."""
         more: dict[int, list[tuple[int, float]]] = {row: [] for row in rows}
         for row, i, c in zip(
             sums.row.tolist(), sums.further_column.tolist(), sums.further_coefficient.tolist(), strict=True
@@ -221,11 +221,11 @@ class LaneSeries:
         ]
 
     def _row_expressions(self, sums: Sums, indices: Any) -> list[tuple[int, tuple[Terms, float]]]:
-        """Return a pair for each expression k in `sums`: the index of its equation, indices[k]; (terms, constant)."""
+        """Return pairs (index of an equation, (terms, constant) of its expression); `indices`: of all equations."""
         return list(zip(indices.tolist(), self._expressions(sums, indices.tolist()), strict=True))
 
     def _make_operations(self, table: OperationGroups, quantity: int) -> list[Operation]:
-        """Return the operations in `table`; `quantity`: index of the quantity that the first of them computes."""
+        """Return the operations in `table`; `quantity`: index of the quantity that the first operation computes."""
         firsts, seconds = (self._expressions(each, range(len(each.column))) for each in (table.first, table.second))
         operations = []
         for kind, begin, end in table.groups[:, :3].tolist():
@@ -243,7 +243,7 @@ class LaneSeries:
         return self.factor_indices.setdefault(key, len(self.factor_indices))
 
     def _shared_sums(self) -> dict[int, tuple[int, int]]:
-        """Find products (cos x) x' and (sin x) x': the recurrences of sin x and cos x yield their coefficients, too.
+        """Find products (cos x) x' and (sin x) x', whose coefficients the recurrences of sin x and cos x yield, too.
 
         (cos x) x' is the derivative of sin x. So the sum in the recurrence of sin x for order k + 1, divided by the
         unit of time, is coefficient k of (cos x) x', except for one term. This term contains coefficient k of x', which
@@ -262,7 +262,7 @@ class LaneSeries:
         return {result: pair for result, pair in pair_of.items() if pair is not None}
 
     def _factors(self, operation: Operation) -> list[tuple[int, int]]:
-        """Return for each result the indices of factors X and Y whose sum of X[j] Y[k - j] its recurrence needs."""
+        """Return, for each result, the indices of factors X, Y: its recurrence contains the sum of X[j] Y[k - j]."""
         kind, results, first, second = operation
         if results[0] in self._carried_sums:
             return []
@@ -422,7 +422,7 @@ class LaneSeries:
     ) -> None:
         """Write code for coefficient k = `order` > 0 of the results of `operations`; `inverse`: 1 / k.
 
-        A PENDING product has a second factor whose coefficient k is not known yet: the term with it is left out.
+        A PENDING product has a second factor whose coefficient k is unknown yet: the term with it is left out.
         """
         pairs = list(dict.fromkeys(pair for operation in operations for pair in self._factors(operation)))
         sums = {}
@@ -488,10 +488,10 @@ class _Row:
 
 
 class _PartialSums(NamedTuple):
-    """Sums of X[j] Y[k - j] over 1 < j < k, and the rows needed to add the terms j = 1 and j = k, which are missing."""
+    """Sums of X[j] Y[k - j] over 1 < j < k, and the rows from which to add the missing terms for j = 1 and j = k."""
 
-    sums: dict[tuple[tuple[int, int], bool], Value]  # keys: ((X, Y), True: for order k + 1); X, Y: indices of factors
-    first_row: Value  # pointer to the row of order 1; if k is 1, to a row of zeros: products with it are then 0
+    sums: dict[tuple[tuple[int, int], bool], Value]  # keys: (indices of factors X and Y, whether it is for order k + 1)
+    first_row: Value  # pointer to the row of order 1; if k is 1, to a row of zeros, so that products are 0
     row_1: Value  # pointer to the row of order 1
     row_before: _Row  # row of order k - 1
 
@@ -501,7 +501,7 @@ class _PartialSums(NamedTuple):
         return self.sums[pair, False] + emit.load(self.first_row, x) * self.row_before.load(y)
 
     def sum_of_next_order(self, pair: tuple[int, int], row: _Row) -> Value:
-        """Return the sum of X[j] Y[k + 1 - j] over 0 < j <= k; `pair`: indices of X, Y; `row`: factors at order k."""
+        """Return the sum of X[j] Y[k + 1 - j] over 0 < j <= k; `pair`: indices of X and Y; `row`: row of order k."""
         emit, (x, y) = self.row_before.emit, pair
         total = self.sums[pair, True] + row.load(x) * emit.load(self.first_row, y)
         return total + emit.load(self.row_1, x) * row.load(y)

@@ -39,7 +39,7 @@ from twoloop.kernels.evaluation.operations import (
 
 MIN_TERMS_SPLIT = 4  # a sum of at least this many terms is computed as two halves in parallel
 ZERO, ONE = constant(DOUBLE, 0.0), constant(DOUBLE, 1.0)
-# names of LLVM intrinsics by names of functions; a function without an intrinsic is called in libm
+# keys: functions; values: LLVM intrinsics (functions built into LLVM). Other functions are called in the library libm
 INTRINSICS = {name: f"llvm.{name}" for name in ("sin", "cos", "exp", "log", "sqrt", "rint", "ceil", "fabs")}
 
 
@@ -159,8 +159,8 @@ class Emitter:
     def loop(self, first: Value, end: Value, initial: Sequence[Value]) -> Iterator[tuple[Value, list[Any], list[Any]]]:
         """Return a context manager that writes a loop over integers from `first` to `end` - 1.
 
-        It yields the integer, the values carried from the previous iteration (`initial` in the first iteration), and a
-        list, to which the caller appends the new values. After the loop, this list has the final values.
+        The context manager yields the integer, the values from the previous iteration (`initial` in the first one), and
+        a list, to which the caller appends the new values. After the loop, this list has the final values.
         """
         builder = self.builder
         is_entered = builder.compare("icmp slt", first, end)
@@ -319,7 +319,7 @@ class Lowering(Algebra[Value]):
     def __init__(self, emit: Emitter, numbers: Coefficients, locations: Mapping[int, Location] = NO_LOCATIONS):
         super().__init__()
         self.emit, self.numbers, self._locations = emit, numbers, dict(locations)
-        self.angles: list[Value] = []  # arguments of sines and cosines, to be compared with LARGEST_ANGLE by `is_valid`
+        self.angles: list[Value] = []  # arguments of sines and cosines; `is_valid` compares these with LARGEST_ANGLE
         self.functions = {kind: partial(emit.function, name) for kind, name in FUNCTIONS.items()}
         self.functions[RECIPROCAL] = lambda x: 1.0 / x
         self._quantities = Quantities(emit, lambda quantity: emit.load(*self._locations[quantity]))
@@ -366,7 +366,7 @@ class Lowering(Algebra[Value]):
         return self._sines_and_cosines[first.key][kind == COSINE]
 
     def run(self, graph: Graph, quantities: Iterable[int], locations: Mapping[int, Location] = NO_LOCATIONS) -> None:
-        """Write code that computes `quantities` in the given order; a quantity in `locations` is stored there."""
+        """Write code that computes `quantities` in the given order, and stores those that have a memory location."""
         if not locations:
             return super().run(graph, quantities)
         for i in quantities:
@@ -399,7 +399,7 @@ class Lowering(Algebra[Value]):
         return [self.affine(expr) for expr in exprs]
 
     def is_valid(self, program: Program, values: Sequence[Value]) -> Value:
-        """Write code for a flag, and return it: 1 if conditions hold, `values` are finite, |angles| < LARGEST_ANGLE."""
+        """Return a flag: 1 if the program's conditions hold, `values` are finite, and |angles| < LARGEST_ANGLE."""
         emit, builder, zero = self.emit, self.emit.builder, self.emit.constant(0.0)
         total = zero
         for value in values:  # values that are not finite make the sum NaN
@@ -415,6 +415,6 @@ class Lowering(Algebra[Value]):
 def lower_program(
     emit: Emitter, program: Program, inputs: Sequence[Value], numbers: Coefficients
 ) -> tuple[Lowering, list[list[Value]]]:
-    """Write code that evaluates a program at `inputs`; return the Lowering that wrote it, and the program's arrays."""
+    """Write code that evaluates a program at `inputs`; return the Lowering used, and the values of the arrays."""
     lowering = Lowering(emit, numbers)
     return lowering, program.run(lowering, inputs)

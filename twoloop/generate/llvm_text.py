@@ -15,7 +15,7 @@ from twoloop.kernels.data.common import OPTIONS
 FAST_MATH_FLAGS = " ".join(sorted(OPTIONS["fastmath"]))  # flags of floating-point instructions, the same as in kernels
 DOUBLE, INTEGER, WORD, BIT, VOID = "double", "i64", "i32", "i1", "void"
 DOUBLES_PER_CACHE_LINE = 8  # size of a cache line of the processor, in doubles
-# if `Module.splits_blocks`, a block is split after this number of instructions: longer ones double the compile time
+# if `Module.splits_blocks`, a block is split after this number of instructions: longer blocks double the compile time
 MAX_BLOCK_LENGTH = 400
 
 
@@ -66,7 +66,7 @@ class Value:
 
 
 class Phi(Value):
-    """Phi node: a value that depends on the block from which control has come to the block of the node."""
+    """Phi node: a value that depends on the block from which the program has jumped to the block of the node."""
 
     __slots__ = ("incoming",)
 
@@ -75,7 +75,7 @@ class Phi(Value):
         self.incoming: list[tuple[Value, Block]] = []
 
     def add_incoming(self, value: Value, block: "Block") -> None:
-        """Add the value that the node has if control comes from `block`."""
+        """Add the value that the node has if the program comes from `block`."""
         self.incoming.append((value, block))
 
     def line(self) -> str:
