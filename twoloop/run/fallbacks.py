@@ -108,6 +108,7 @@ FAR_BEFORE = 0.2
 # if no step across a singular position succeeds, tolerances and the longest allowed time between evaluations are
 # multiplied by these factors (the time becomes unlimited if forces cannot be short)
 TOLERANCE_FACTOR, GAP_FACTOR = 10.0, 4.0
+MAX_ATTEMPTS_IN_PYTHON = 200  # largest number of failed steps across a position if Python evaluates the equations
 NODE_DISTANCES = 1.0, 0.5, 0.25  # values of Limits.node_distance (see there) that are tried in turn
 
 
@@ -194,6 +195,7 @@ def cross_singularity(run: Run, past: list[TimedState]) -> tuple[Plan, Array]:
     if run.mirrored_size > run.t1 - clock[a.T]:  # the run ends soon after the position: first try a step beyond t1
         ends.reverse()
     run.origins = [Origin(*start, limits, beyond) for limits in _limits(run) for beyond in ends for start in origins]
+    run.attempts_left = np.inf if compiled else MAX_ATTEMPTS_IN_PYTHON
     run.crossings.append([base or (float(clock[a.T]), run.state.copy())])
     control = run.control.copy()
     control[: a.N_RULE] = plan.rule
@@ -336,6 +338,9 @@ def handle_crossing(run: Run, plan: Plan, control: Array, code: int, n_accepted:
         clock[a.H_LONG] = max(clock[a.H_LONG], run.crossing_size)
         clock[a.H_NEXT] = max(clock[a.H_NEXT], run.crossing_size)
     if code == a.PAUSED and n_accepted == 0:
+        run.attempts_left -= 1
+        if run.attempts_left <= 0:
+            run.sizes_to_try, run.origins = [], []
         if clock[a.FAILURE_CODE] not in (indices.SINGULAR, indices.OUTER_DIVERGED):
             run.sizes_to_try = [size for size in run.sizes_to_try if size < run.crossing_size]
         if run.sizes_to_try:

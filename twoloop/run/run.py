@@ -115,10 +115,11 @@ class Run:
         self.control[[loop_state.BY_TIME, loop_state.BY_STATE]] = self.short_forces
         self.forces_may_be_steep = steep or plan.max_gap == 1.0
         self.crossings: list[list[tuple[float, Array]]] = []  # states before and after steps across singular positions
-        # the next six attributes belong to steps across a singular position, see fallbacks.py
+        # the next seven attributes belong to steps across a singular position, see fallbacks.py
         self.mirrored_size = 0.0  # size (s) of a step from before a singular position to as far beyond it
         self.crossing_tolerances = self.tolerances  # tolerances of steps across singular positions
         self.sizes_to_try: list[float] = []  # step sizes (s) still to be tried across a singular position
+        self.attempts_left = np.inf  # number of failed attempts after which the search for a step across it ends
         self.crossing_size = 0.0  # size (s) of the last attempted step across a singular position
         self.piece_ends: list[float] = []  # ends (s) of next steps on a polynomial across a singular position
         self.origins: list[Any] = []  # `Origin` of each polynomial still to be tried across a singular position
