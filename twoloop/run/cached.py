@@ -1,9 +1,8 @@
 """Cache integrators: a call with the same options as an earlier call reuses the plan, code, arrays and checks.
 
 `CachedIntegrator` calls `start_and_advance` of kernels/cached_run.py, which checks the start and takes the first chunk
-of steps. A chunk is the steps of one call of compiled code. Short runs end within this chunk: the fields of the result
-are then computed when they are read. If the run is longer, or Python has to check something, `IntegrationLoop` takes
-over after the chunk.
+of steps (the steps of one call of compiled code). If a run ends in this chunk, the fields of its result are computed
+when they are read. If the run is longer, or Python has to check something, `IntegrationLoop` takes over.
 """
 
 import time
@@ -75,8 +74,8 @@ from twoloop.run.workspace import GAMMA_ACCURACY, sparse_factors_pay
 Array = NDArray[np.float64]
 
 MAX_IDLE = 4  # largest number of unused integrators kept for equal options; each thread that integrates takes one
-# the first call of compiled code may attempt this many times `Run.chunk` steps, or `Run.chunk` steps if states must be
-# sampled after each chunk (`StiffnessMonitor`). With more steps, a run could ignore Ctrl-C for more than 0.1 s
+# the first call of compiled code attempts at most this many times `Run.chunk` steps (once if `StiffnessMonitor` must
+# sample a state after each chunk). With more steps, a run could ignore Ctrl-C for more than 0.1 s
 N_FIRST_CHUNKS = 4
 N_SKIPPED_CALLS = 16  # after an exception in a callback, this number of calls do not use the cached integrator
 STEP_FIELDS = (*STEP_ARRAYS, "stats")  # fields of a result that are computed from the array of steps
@@ -126,8 +125,8 @@ class CachedIntegrator:
         self.evaluation, self.loops, self.code, self.skips = StartEvaluation(checked), cached_run(), code, 0
         self.arrays, self.callbacks = arrays_of(run, self.evaluation, code, definite, options, n_attempts), checked.kit
         self._start_and_advance = entry_point(self.loops.start_and_advance)
-        # `arrays.block` contains a report (numbers about the run, times and steps), and then the states, which begin at
-        # the index states_begin. The report on one state and no step begins at one_state_begin; longer ones, earlier
+        # `arrays.block` contains a report (numbers about the run, times and steps), and from the index states_begin on
+        # the states. A report on one state and no step begins at one_state_begin; longer reports begin earlier
         self.states_begin, self.width = self.arrays.report.size, len(run.state)
         self.one_state_begin = self.states_begin - self.loops.N_HEAD - 1
         self.loop_used = False  # whether `IntegrationLoop` may have changed attributes of `run` other than arrays
@@ -141,9 +140,9 @@ class CachedIntegrator:
 
     @staticmethod
     def can_provide(run: Run, output: OutputRequest, shared: SharedSetup | None) -> bool:
-        """Return whether a cached integrator may be used for the requested `output`; else a new run must be set up."""
-        # states at output times and `sol` must agree, but each would get an interpolator of its own. If systems share
-        # the run, the next system overwrites the parameters that `sol` would use
+        """Return whether a cached integrator can provide the requested `output`; if not, a new run must be set up."""
+        # states at output times and `result.sol` must agree, but each would get an interpolator of its own. If systems
+        # share the run (`shared`), the next system would overwrite the parameters that `result.sol` uses
         if output.dense and (output.interpolated_times is not None or shared is not None):
             return False
         return output.interpolated_times is None or not (
@@ -190,14 +189,14 @@ class CachedIntegrator:
                 n = self._start_and_advance(*start, loops.STATE_CHECKED)
             if n == loops.UNCHOSEN and self._pivots_suit_start(t0, q0):
                 n = self._start_and_advance(*start, loops.CHOICES_CHECKED)
-        except Exception as error:  # from a callback: a new run is set up, which handles it
+        except Exception as error:  # a callback raised it: the caller sets up a new run, which reports the error
             if raised_by_handler(error):
                 raise
             self.skips, arrays.last_start[loops.N_EQUAL] = N_SKIPPED_CALLS, loops.NEVER
             return None
         self.cpu_time = clock() - began
         fields: dict[str, Any] = {"status": REACHED_END}
-        n_rows, timed_states = n, None  # n: number of steps (and of states after the start), or a code if negative
+        n_rows, timed_states = n, None  # n: number of steps and of states after the start; if negative, a code
         rows_differ = run.rows_warning != "" and (rows := arrays.start_rows.tobytes()) != self.independent_rows
         if rows_differ and n >= 0 and rows in self.redundancy:
             self._use_independent_rows(rows)
@@ -285,7 +284,7 @@ class CachedIntegrator:
         return (timed_states,)
 
     def _check_new_start(self, t1: float, q0: Array, v0: Array) -> bool:
-        """Find redundant rows at a new start, and check its parameters; return False if `set_up` must check more."""
+        """Find redundant rows at a new start, and compare callbacks with traces; return False if `set_up` must run."""
         run = self.run
         if run.rows_warning:  # rounding may decide which of several dependent rows is the redundant one
             independent = self.arrays.start_rows.tobytes()
@@ -299,7 +298,7 @@ class CachedIntegrator:
         return self.parametric is None or self.parametric.callbacks_agree(run.t0, q0, v0, t1, mass, derivatives)
 
     def _use_independent_rows(self, rows: bytes) -> None:
-        """Set the redundant rows of the run and the warning of them, given the indices of independent rows as bytes."""
+        """Set the run's redundant rows and its warning; `rows`: indices of the independent rows, as bytes."""
         run = self.run
         run.redundant, run.rows_warning = self.redundancy[rows]
         self.run_fields, self.independent_rows = (run.rank, run.redundant, self.run_fields[-1]), rows
@@ -319,7 +318,7 @@ class CachedIntegrator:
         def states(all_states: bool) -> Array:
             sample = Sample(float(t[0]), rows[0], n)
             sample.add(t[1:], rows[1:], float(t[-1]), rows[-1])
-            # also check states with extreme t, q or v: then the same run, repeated, lies within the checked region
+            # also check the states with extreme t, q or v: then a repetition of this run lies in the checked region
             return sample.states() if all_states else np.concatenate([extreme_states(t, rows[:, :n]), sample.states()])
 
         checks = t1, self.check_derivatives, REACHED_END, "", is_due, is_inside
@@ -339,8 +338,8 @@ def fields_of(
 
 
 def _deferred_field(
-    data: Array,  # copy of the report, times, steps and states of a run
-    timed_states: tuple[Array, Array] | None,  # output times and states; None: all steps
+    data: Array,  # copy of the report on a run: numbers, times, steps and states
+    timed_states: tuple[Array, Array] | None,  # output times and states; None: output at the ends of all steps
     run_fields: tuple[int, NDArray[np.int64], bool],  # rank; redundant rows; whether steps called generated code
     cpu_time: float,
     system: ConstrainedSystem,
@@ -365,7 +364,7 @@ def _deferred_field(
     return NON_STEP_DEFAULTS | state_fields(system.n_q, t, rows) | fields | options.metadata
 
 
-RECHECK_PIVOT = 0.1  # `set_up` checks a start if its smallest pivot is below this times that of the first start
+RECHECK_PIVOT = 0.1  # `set_up` checks a start if (smallest pivot there) / (smallest pivot at first start) is below this
 
 
 def arrays_of(
@@ -438,12 +437,12 @@ def arrays_of(
 def _choice_as_array(choice: PivotChoice | None) -> tuple[NDArray[np.int64], float]:
     """Return the pivots that generated code uses, as an array of integers for kernels, and a factor s.
 
-    The array is empty if `choice` is None. If M is singular, the code adds s g^T g to M for some constraint rows g, so
-    that M becomes definite; s = 1 if nothing is added.
+    The array is empty if `choice` is None. If M is singular, the code adds s g^T g to M for some constraint rows g: so
+    M becomes definite. If nothing is added, s is 1.
     """
     if choice is None:
         return np.zeros(0, dtype=np.int64), 1.0
-    # OF_PYTHON: kernels cannot check this choice of pivots at a new start, because Python tried several terms of M
+    # OF_PYTHON: kernels cannot check these pivots at a new start, because Python tried several terms s g^T g
     index = cached_run().OF_PYTHON if choice.is_refined else int(np.searchsorted(-MIN_PIVOTS, -choice.min_pivot))
     numbers = index, len(choice.rows), len(choice.added_rows), *choice.rows, *choice.added_rows
     return np.array(numbers, dtype=np.int64), (*choice.scales, 1.0)[0]
@@ -463,7 +462,7 @@ class CacheEntry(NamedTuple):
     code: GeneratedCode | None
     definite: bool  # whether M was definite at the start
     for_other_starts: bool  # whether a copy of the run may be moved to another start
-    idle: list[CachedIntegrator] | None  # integrators not in use; None: only `set_up` can start this run
+    idle: list[CachedIntegrator] | None  # integrators not in use; None: each run needs `set_up`
     shared: SharedSetup | None = None  # setup for systems that differ only in parameters; None: one system
 
 
@@ -567,12 +566,12 @@ def _make_cache_entry(run: Run, code: GeneratedCode | None, t1: float, options: 
     )
     start = t0, q0.tobytes(), v0.tobytes()
     can_start = for_other_starts and not run.start_warning and not system.called_in_python
-    idle: list[CachedIntegrator] | None = [] if can_start else None  # None: only `set_up` can start this run
+    idle: list[CachedIntegrator] | None = [] if can_start else None  # None: each run needs `set_up`
     return CacheEntry(run.copy(), start, t1, code, definite, for_other_starts, idle)
 
 
 def _trace_cache(system: ConstrainedSystem) -> TraceCache:
-    """Return the TraceCache of a system; the first call finds it by `trace_cache_of`, later calls reuse it."""
+    """Return the TraceCache of a system; the first call finds it by `trace_cache_of`, and the system keeps it."""
     cache: TraceCache = system.remembered(("trace cache", trace_cache_of), lambda: trace_cache_of(system))
     return cache
 
@@ -664,7 +663,7 @@ def _create_run(
 
 
 def _check_start(system: ConstrainedSystem, t0: float, q0: Array, v0: Array, options: Options) -> None:
-    """Check a start, unless the last check was of the same start; raise if the start is refused."""
+    """Check a start, unless the last checked start was the same; raise an exception if the start is refused."""
     derivatives, harmless = options.check_derivatives, HARMLESS * (options.atol + options.rtol * np.abs(v0))
 
     def check_values() -> None:

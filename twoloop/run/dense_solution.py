@@ -33,16 +33,16 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-MAX_DIVIDED_INTERVALS = 512  # when interior states of more intervals than this are cached, the cache is emptied
-MAX_ACCURATE_INTERVALS = 65536  # largest number of intervals remembered to be accurate without interior states
-# a polynomial counts as accurate if it violates constraints and equations of motion by at most MAX_ERROR tolerances
-# (across a singular position, by MAX_ERROR_ACROSS tolerances: velocity errors are ten times the violation there)
+MAX_DIVIDED_INTERVALS = 512  # when states within more intervals than this are cached, the cache is emptied
+MAX_ACCURATE_INTERVALS = 65536  # largest number of intervals remembered to be accurate without states within them
+# a polynomial is accurate if it violates constraints and equations of motion by at most MAX_ERROR tolerances (across a
+# singular position, where velocity errors are ten times the violation, by at most MAX_ERROR_ACROSS tolerances)
 MAX_ERROR, MAX_ERROR_ACROSS = 10.0, 1.0
 N_REPAIR_STEPS = 4  # number of steps into which an interval is divided if its polynomial is not accurate
 
 
 class StateTable(NamedTuple):
-    """States at the ends of accepted steps: n times, n rows [q, v, a], and the kinds of the n - 1 intervals between."""
+    """States at the ends of steps: n times, n rows [q, v, a], and the kinds of the n - 1 intervals between them."""
 
     t: Array
     states: Array
@@ -64,8 +64,8 @@ def ranks_at(system: ConstrainedSystem, t: float, q: Array, v: Array, rtol: floa
 class Interpolator:
     """Interpolator between the states of a `StateTable`, with a workspace of its own.
 
-    `t0`, `row`: time and [q, v, a] of a state of the run. `ranks`: rank of C_q, and of all constraint rows. `plans`:
-    for each kind of intervals that are too long for one polynomial, the plan of the method that divides them into
+    `t0`, `row`: time and [q, v, a] of a state of the run. `ranks`: rank of C_q, and rank of all constraint rows.
+    `plans`: intervals of these kinds are too long for one polynomial; the method of the plan divides each interval into
     `plan.parts` equal steps.
     """
 
@@ -91,13 +91,13 @@ class Interpolator:
         self.fixed_order = fixed_order_form(system, t0, row[: system.n_q], *self.plans.values())
         self.matrices = max((plan.matrices for plan in self.plans.values()), default=0)
         self._create_workspace()
-        self.failures, self.warns = 0, True  # number of states not projected in the last call; whether to warn of this
-        # for the time at which a divided interval begins: times and states within it, including both of its ends
+        self.failures, self.warns = 0, True  # number of failed projections in the last call; whether to warn of these
+        # key: time at which a divided interval begins; value: times and states within the interval and at its ends
         self.interior_states: dict[float, tuple[Array, Array]] = {}
-        # for the time at which a step across a singular position begins: its `memory`, which contains a polynomial
+        # key: time at which a step across a singular position begins; value: the step's `memory`, with a polynomial
         self.crossing_memories: dict[float, Array] = {}
-        self.accurate_intervals: set[float] = set()  # times at which intervals that need no interior states begin
-        self.may_divide = True  # whether interior states may be computed; False if they were read from a file
+        self.accurate_intervals: set[float] = set()  # start times of intervals with an accurate polynomial
+        self.may_divide = True  # whether to compute states within intervals; False: they were read from a file
         self._allocate_scratch()
 
     def _create_workspace(self) -> None:
@@ -251,10 +251,10 @@ class Interpolator:
         return out
 
     def _repair_interval(self, table: StateTable, interval: Integers, smallest: float) -> None:
-        """Replace an inaccurate polynomial of an interval by the best of three other ones, unless it is better.
+        """Try three other polynomials for an interval whose polynomial is inaccurate; keep the most accurate of all.
 
-        The three go through states of a step across a singular position; through ends of N_REPAIR_STEPS steps; through
-        the ends of the interval only. `smallest`: violation by the present polynomial, see `_estimate_residuals`.
+        They go through states of a step across a singular position, the ends of N_REPAIR_STEPS steps, or only the ends
+        of the interval. `smallest`: violation by the present polynomial, see `_estimate_residuals`.
         """
         i, kind = int(interval[indices.FIRST_OWN]), int(interval[indices.KIND])
         begin = float(table.t[i])
@@ -294,7 +294,7 @@ class Interpolator:
         return self._states_in_crossing_step(table, i, plan.memory) if succeeded else None
 
     def _states_in_crossing_step(self, table: StateTable, i: int, memory: Array) -> tuple[Array, Array]:
-        """Return times and states within interval i, from the polynomial that a step across it stored in `memory`."""
+        """Return times and states within interval i from the polynomial of a crossing step, stored in its `memory`."""
         from twoloop.kernels.steps.crossing_step import state_at
 
         n, options = self.system.n_q, crossing_plan(self.system.n_q).options
@@ -325,7 +325,7 @@ class Interpolator:
         return self.repair_plans[is_stiff]
 
     def _split_intervals(self, table: StateTable, intervals: Integers) -> tuple[StateTable, Integers, Integers]:
-        """Return a StateTable of cached interior states, the intervals (rows) that have them, and other intervals."""
+        """Return a StateTable of cached states within `intervals`, the intervals that have these, and the others."""
         start_times = table.t[intervals[:, indices.FIRST_OWN]].tolist()
         is_divided = np.array([t in self.interior_states for t in start_times], dtype=bool)
         pairs = [self.interior_states[t] for t in start_times if t in self.interior_states]
@@ -365,7 +365,7 @@ class Interpolator:
         return interior_states
 
     def interior_blocks(self, table: StateTable) -> Iterator[tuple[Array, Array]]:
-        """Yield interior states of all divided intervals, in blocks, so that the caller can store them in a file.
+        """Yield the states within all divided intervals, in blocks, so that the caller can store them in a file.
 
         A block has times (m, parts + 1) and rows [q, v, a] (m, parts + 1, 3 n_q) of m intervals; missing ones are NaN.
         """
@@ -381,7 +381,7 @@ class Interpolator:
             yield t, states
 
     def restore_interior_states(self, t: Array, states: Array) -> None:
-        """Use interior states read from a file, which `interior_blocks` has yielded; compute none from now on."""
+        """Use states within intervals that were read from a file (see `interior_blocks`); compute no others."""
         self.parts, self.may_divide = t.shape[1] - 1, False
         self._allocate_scratch()
         sizes = np.isfinite(t).sum(axis=1).tolist()
@@ -462,7 +462,7 @@ class OutputInterpolation:
         self._interpolator, self._rows = interpolator, interpolator.states(table, times)
 
     def complete_rows(self, times: Array) -> Array | None:
-        """Return rows [q, v, a, lam] at the times given to `interpolate`; None if the computation fails at a time."""
+        """Return rows [q, v, a, lam] at `times`, for which `interpolate` has stored [q, v]; return None on failure."""
         interpolator, rows = self._interpolator, self._rows
         if interpolator is None or interpolator.failures > 0:
             return None
@@ -503,7 +503,7 @@ class DenseState:
         self.q, self.v = self._columns_by_time(rows[:, :n]), self._columns_by_time(rows[:, n:])
 
     def _columns_by_time(self, rows: Array) -> Array:
-        """Return `rows` at ascending times as columns in the order of `self.t`; if that is a scalar, the only row."""
+        """Return `rows`, given at ascending times, as columns in the order of `self.t`; the only row for a scalar."""
         columns = np.empty(rows.shape[::-1])
         columns[:, self._order] = rows.T
         return columns if np.ndim(self.t) else columns[:, 0]
@@ -575,7 +575,7 @@ class DenseSolution:
         times = check_real("t", t)
         if times.ndim > 1:
             raise ValueError(f"t must be a number or have shape (n,); given {shaped(times)}")
-        is_outside = ~((times >= self.t_min) & (times <= self.t_max))  # also true for NaN
+        is_outside = ~((times >= self.t_min) & (times <= self.t_max))  # also True for NaN
         if is_outside.any():
             raise ValueError(
                 f"t must lie within the run, from {self.t_min!r} to {self.t_max!r}; given "

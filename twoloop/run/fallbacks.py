@@ -21,9 +21,9 @@ from twoloop.run.run import Run
 from twoloop.run.singular_positions import TimedState
 from twoloop.run.workspace import kit_for_plan, make_kit
 
-# let r be the duration of the shortest change of forces or drives that a run has seen, divided by the longest time
-# between its evaluations. If r < REPEAT_BELOW, the run may have missed shorter changes, and is repeated. If
-# r < WARN_BELOW, it may even have missed changes of the same duration: it warns if it is not repeated any more
+# let r be (duration of the shortest change of forces or drives seen in a run) / (longest time between evaluations). If
+# r < REPEAT_BELOW, the run may have missed shorter changes, and is repeated. If r < WARN_BELOW, the run may even have
+# missed changes of this duration: it warns if it is not repeated any more
 REPEAT_BELOW, WARN_BELOW = 2.0, 1.25
 EVALUATIONS_PER_CHANGE = 4.0  # number of evaluations that a repetition makes within the shortest change seen so far
 MAX_REFINEMENT = 8.0  # largest factor by which a repetition reduces the longest time between evaluations
@@ -64,10 +64,10 @@ MAX_RESIDUAL = 1e-8  # largest residual of the equations for v after a jump, rel
 
 
 def state_after_jump(system: ConstrainedSystem, t: float, q: Array, v: Array) -> Array | None:
-    """Return [q, v] made consistent at t, v by impulses of the constraints; None if no velocities are consistent.
+    """Return a consistent state [q, v] at t near the given one; None if no velocities are consistent.
 
-    This is necessary after a jump of the rate C_t, or of b in A v + b = 0. Solve M (v+ - v) + G^T p = 0 and
-    G v+ + (C_t, b) = 0 for the velocities after the jump, v+, and the impulses p.
+    This is necessary after a jump of the rate C_t, or of b in A v + b = 0: impulses p of the constraints then change v
+    to v+. The equations M (v+ - v) + G^T p = 0 and G v+ + (C_t, b) = 0 are solved for v+ and p.
     """
     q = corrected_positions(system, t, q)
     equations, norms, largest = scaled_equations(system, t, q)
@@ -94,37 +94,37 @@ def scaled_equations(system: ConstrainedSystem, t: float, q: Array) -> tuple[Arr
     return np.block([[mass, scaled.T], [scaled, np.zeros((len(rows), len(rows)))]]), norms, largest
 
 
-# sizes of the steps that are tried in turn to get across a singular position, relative to the first one. Larger sizes
-# help if a step ends before the position or too near it; smaller ones, if its error is too large
+# ratios of the step sizes that are tried in turn across a singular position to the first one. Larger sizes help if a
+# step ends before the position or too near to it; smaller sizes help if the error of a step is too large
 SIZE_RATIOS = (1.0, *(1.2**k for k in range(1, 12)), *(0.85**k for k in range(1, 28)))
 LARGEST_RATIO = max(SIZE_RATIOS)
-# if a run is near a singular position before it has lasted FIRST_STEPS times its longest recent step, it may have begun
-# beside this position, with short steps. Then much larger step sizes, LARGE_RATIOS, are tried across it, too
+# if a run comes near a singular position before the time FIRST_STEPS * (longest recent step) has passed, its steps may
+# still be as short as at the start. Then much larger step sizes are also tried: LARGE_RATIOS times the first size
 FIRST_STEPS = 30.0
 LARGE_RATIOS = tuple(1.2**k for k in range(12, 30))
-# "distance" of a state from a singular position: smallest pivot of C_q, relative to its largest value in the run.
-# The base, the state at which the polynomial across the position begins, should have at least the distance FAR_BEFORE
+# "distance" of a state from a singular position: (smallest pivot of C_q there) / (largest value of this pivot in the
+# run). The polynomial across the position should begin at a state with at least the distance FAR_BEFORE
 FAR_BEFORE = 0.2
-# if no step across a singular position succeeds, tolerances and the longest allowed time between evaluations are
-# multiplied by these factors (the time becomes unlimited if forces cannot be short)
+# if no step across a singular position succeeds, the tolerances are multiplied by TOLERANCE_FACTOR, and the longest
+# allowed time between evaluations by GAP_FACTOR (if no forces are short, this time becomes unlimited)
 TOLERANCE_FACTOR, GAP_FACTOR = 10.0, 4.0
 MAX_ATTEMPTS_IN_PYTHON = 200  # largest number of failed steps across a position if Python evaluates the equations
-NODE_DISTANCES = 1.0, 0.5, 0.25  # values of Limits.node_distance (see there) that are tried in turn
+NODE_DISTANCES = 1.0, 0.5, 0.25  # values that are tried in turn for the field `node_distance` of Limits
 
 
 class Limits(NamedTuple):
     """Limits for the polynomial and step across a singular position; if no step succeeds, wider ones are tried."""
 
     has_wide_gaps: bool  # whether the longest allowed time between evaluations is multiplied by GAP_FACTOR
-    may_approach: bool  # whether a step may end before the singular position, nearer to it than it began
+    may_approach: bool  # whether a step may end before the singular position, but nearer to it than the step began
     tolerance_factor: float  # factor by which the tolerances of these steps are multiplied
-    # nodes nearer to the position than this factor times the usual limit are left out, because their rounding errors
-    # (which the error estimate shows) are larger. If a motion is slow near the position, few nodes are farther away
+    # the polynomial uses only nodes whose distance from the position is at least this factor times the usual limit:
+    # nearer nodes have larger rounding errors. But if the motion is slow near the position, few nodes are far enough
     node_distance: float
 
 
 class Origin(NamedTuple):
-    """Where a polynomial across a singular position begins, and its limits; several step sizes are tried with each."""
+    """Begin and limits of a polynomial across a singular position; several step sizes are tried with one Origin."""
 
     earliest: float  # no node of the polynomial is before this time (s)
     base: TimedState | None  # earlier state at which the polynomial begins; None: it begins at the current state
@@ -132,13 +132,13 @@ class Origin(NamedTuple):
     may_end_beyond: bool = False  # whether the polynomial may end beyond the end of the run
 
 
-# the search for a base goes back in time. It stops at a state with less than this fraction of the largest distance so
-# far, as another singular position is near there
+# the search for a state at which the polynomial begins goes back in time. It stops at a state whose distance is less
+# than this fraction of the largest distance found: another singular position is near that state
 MIN_DISTANCE_RATIO = 0.5
 
 
 def requires_crossing(run: Run, code: int) -> bool:
-    """Return whether special steps across a singular position must follow, as `advance` has returned `code`."""
+    """Return whether steps across a singular position must follow after `advance` has returned `code`."""
     a, notes = run.a, run.work.notes
     if code == a.SWITCH_METHOD:
         from twoloop.kernels.steps.lobatto_step import TIGHT_TOLERANCE
@@ -149,10 +149,10 @@ def requires_crossing(run: Run, code: int) -> bool:
 
 
 def switch_method(run: Run) -> None:
-    """Continue a run with the substitute of its method, whose steps fail or do not suit the motion."""
+    """Continue a run with the substitute for its method, because this method fails or does not suit the motion."""
     substitute = run.plan.substitute
     assert substitute is not None
-    run.plan, run.memory = substitute.fresh(), substitute.memory  # `run.memory` holds initial values, and never changes
+    run.plan, run.memory = substitute.fresh(), substitute.memory  # `run.memory` keeps the initial values of the memory
     renew_kit(run)
     run.substituted = True
     run.write_step_control(run.plan)
@@ -201,7 +201,7 @@ def cross_singularity(run: Run, past: list[TimedState]) -> tuple[Plan, Array]:
     control[: a.N_RULE] = plan.rule
     control[a.SYMMETRIC], control[a.MAY_CROSS], control[a.MAX_ATTEMPTS] = 0.0, 0.0, 1.0
     control[a.MAY_SWITCH] = control[a.TAKES_MANY] = 0.0
-    run.piece_ends = []  # an earlier run may have left some, as integrators reuse `run`
+    run.piece_ends = []  # integrators reuse `run`, so that times of an earlier run may be left
     if control[a.FIXED_STEP] == 0.0:
         control[a.MAX_EVALUATION_GAP] = 1.0 if run.forces_may_be_steep else NODE_GAP / (1.0 - BACKWARD_FRACTION)
     clock[a.LIMIT_AGE] = 0.0
@@ -252,11 +252,11 @@ def _prepare_next_origin(run: Run, plan: Plan, control: Array) -> None:
 
 
 def _find_base_state(run: Run, past: list[TimedState]) -> tuple[TimedState | None, float]:
-    """Return the base (first state) of a polynomial across a singular position, and a step size (s) from there.
+    """Return the base (first state) of a polynomial across a singular position, and a step size (s) from the base.
 
-    The base is the latest state in `past` that is far from the position, because rounding changes velocities near it.
-    If none is far, it is the farthest one; None if the current state is farther than all of them. The step size is
-    such that the step would end as far beyond the position as the base is before it, if distances changed linearly.
+    Rounding changes velocities near the position. So the base is the latest state in `past` that is far from it, or
+    the farthest state if none is far, or None if the current state is the farthest. The step size is such that the step
+    would end as far beyond the position as the base is before the position, if distances changed linearly.
     """
     a, clock, t, n = run.a, run.clock, float(run.clock[run.a.T]), run.system.n_q
 
@@ -285,9 +285,9 @@ def _find_base_state(run: Run, past: list[TimedState]) -> tuple[TimedState | Non
 
 
 def sizes_across(first_size: float, allowed: float, near_start: bool = False) -> list[float]:
-    """Return the step sizes (s), at most `allowed`, to be tried in turn across a singular position.
+    """Return the step sizes (s), at most `allowed`, that are tried in turn across a singular position.
 
-    They are `first_size` times SIZE_RATIOS; if `near_start`, also `first_size` times LARGE_RATIOS.
+    These are `first_size` times SIZE_RATIOS; if `near_start`, also `first_size` times LARGE_RATIOS.
     """
     sizes = [first_size * ratio for ratio in (SIZE_RATIOS + LARGE_RATIOS if near_start else SIZE_RATIOS)]
     return [min(first_size, allowed), *(size for size in sizes[1:] if size < allowed)]
@@ -315,7 +315,7 @@ def handle_crossing(run: Run, plan: Plan, control: Array, code: int, n_accepted:
     stored = plan.memory[-kernels.N_STORED :]
     end = float(stored[kernels.END])  # time at which the polynomial ends; -inf: no polynomial
     clock[a.LARGEST_PIVOT] = max(clock[a.LARGEST_PIVOT], stored[kernels.LARGEST_PIVOT])
-    # the current time, with a margin because the end of a piece may have a rounding error
+    # current time plus a margin for the rounding error of the end of a piece
     t_now = float(clock[a.T] + kernels.ROUNDING * run.crossing_size + 4.0 * np.spacing(abs(clock[a.T])))
     if code in (a.PAUSED, a.RANK_LOST) and end > t_now:
         if not run.piece_ends:
@@ -370,7 +370,7 @@ def handle_crossing(run: Run, plan: Plan, control: Array, code: int, n_accepted:
 
 
 def apply_jump(run: Run, t1: float) -> bool:
-    """Let velocities jump because a drive's velocity (C_t or b) jumps, and restart the method; return False on failure.
+    """Change velocities because a drive's velocity (C_t or b) jumps, and restart the method; return False on failure.
 
     The state after the jump is stored in `run.new_state`, for the next call of `advance`.
     """

@@ -84,8 +84,7 @@ MAX_STORED_SIGNALS = 3  # number of Ctrl-C signals that are stored; the next one
 class Interrupts:
     """Handler of Ctrl-C during a run. It replaces Python's own handler, but never one that the user has installed.
 
-    It is active from `install_handlers` to `restore_handlers`. Before, Ctrl-C raises KeyboardInterrupt as usual,
-    because no result would be lost yet.
+    The handler is active from `install_handlers` to `restore_handlers`. Before, Ctrl-C raises KeyboardInterrupt.
     """
 
     n_signals, _is_installed = 0, False  # n_signals: number of times that Ctrl-C was pressed
@@ -102,9 +101,9 @@ class Interrupts:
         return self
 
     def returns_result(self, error: BaseException) -> bool:
-        """Return whether a run that the exception `error` ended still returns a result, because Ctrl-C caused it.
+        """Return whether Ctrl-C caused the exception `error` that ended a run: then the run still returns a result.
 
-        It does not if a user's handler raised `error`, or if Ctrl-C was pressed more than MAX_STORED_SIGNALS times.
+        Return False if a user's handler raised `error`, or if Ctrl-C was pressed more than MAX_STORED_SIGNALS times.
         """
         if self.handlers is None and raised_by_handler(error):
             return False
@@ -150,8 +149,8 @@ CHUNK_TO_EVENT = 16  # attempted steps in a chunk if an event may end the run, b
 CHUNK_TIME = 0.05
 # statuses whose message may say that stability limited the steps
 STATUSES_WITH_STIFFNESS_NOTE = {Status.REACHED_END, Status.EVENT, Status.MAX_STEPS, Status.TIME_LIMIT, Status.STAGNATED}
-# the polynomial across a singular position may begin at one of the last N_RECENT states, or at one of the last
-# N_RECENT states before them that a long step reached. These are searched for among the last N_LAST_STATES states
+# the polynomial across a singular position may begin at one of the last N_RECENT states, or at the end of one of the
+# last N_RECENT long steps before these; long steps are searched for among the last N_LAST_STATES states
 N_RECENT, N_LAST_STATES = 16, 256
 CROSSING_OVERSHOOT = 100.0  # a crossing step may end beyond t1 by at most this multiple of the run's duration
 NO_KINDS = np.zeros(0, dtype=np.int64)  # kinds of intervals if no states between steps are requested
@@ -167,7 +166,7 @@ class IntegrationLoop:
     `start`: None if the run is at its start. If the caller has already taken the first chunk of steps, `start` is the
     row [q, v, a, lam] at the start, and the caller then calls `add_first_chunk`. `system`: system in the result,
     given if later runs will overwrite arrays of `run.system`. `report`: called after each chunk with the time reached.
-    `is_final_attempt`: warn if the run may have missed short changes of forces; if False, the caller repeats such runs.
+    `is_final_attempt`: whether to warn if the run may have missed short changes of forces; else the caller repeats it.
     """
 
     def __init__(
@@ -198,7 +197,7 @@ class IntegrationLoop:
         has_terminal_event = request.events is not None and any(event.terminal < np.inf for event in request.events)
         if has_terminal_event:
             self.largest_chunk = run.chunk = CHUNK_TO_EVENT
-        # progress is checked whenever `check_interval` more steps have been attempted; `next_check`: total at that time
+        # progress is checked after every `check_interval` attempted steps; `next_check`: their number at the next check
         self.check_interval = self.next_check = run.chunk
         self.plan, self.control, self.kit = run.plan, run.control, run.kit  # replaced while steps cross a singularity
         self.counts = INITIAL_COUNTS.copy()
@@ -289,9 +288,9 @@ class IntegrationLoop:
         except KeyboardInterrupt:
             self.code = INTERRUPTED
         except Exception as error:
-            # A callback raised the exception. If it was called to sample forces ahead of a step, perhaps at a state
-            # that no motion reaches, continue without samples. Else end the run. Its caller gets the exception, unless
-            # an event has ended the run before this step
+            # A callback raised the exception. If the callback was called to sample forces ahead of a step, perhaps at
+            # a state that no motion reaches, continue without samples. Else end the run: the caller of the run gets the
+            # exception, unless an event has ended the run before this step
             if run.clock[a.SAMPLES_MOTION] == 1.0 and not self.interrupts.n_signals:
                 run.clock[a.SAMPLES_MOTION] = self.control[a.SAMPLE_MOTION] = 0.0
             elif is_crossing and not run.system.called_in_python and not self.interrupts.n_signals:
@@ -406,7 +405,7 @@ class IntegrationLoop:
         return ends[-N_RECENT:] + states[-N_RECENT:]
 
     def _correct_last_state(self) -> None:
-        """Replace the last recorded [q, v, a] by the values at that time of a polynomial across a singular position."""
+        """Replace the last recorded [q, v, a] by `run.state`, the value of a polynomial across a singular position."""
         run = self.run
         t, row = float(run.clock[run.a.T]), run.state[: 3 * run.system.n_q]
         self.recorder.correct_last_state(t, row)
@@ -414,13 +413,13 @@ class IntegrationLoop:
             self.latest_chunks[-1][1][-1, : len(row)] = row
 
     def _needs_substitute(self, in_crossing: bool) -> bool:
-        """Return whether another method must take over, as steps became too small away from singular positions."""
+        """Return whether another method must take over because steps became too small far from singular positions."""
         run, a = self.run, self.run.a
         is_too_small = self.code == a.STEP_TOO_SMALL and run.control[a.MAY_SWITCH] == 1.0
         return is_too_small and not in_crossing and run.work.notes[indices.NEARLY_SINGULAR] != 1.0
 
     def _build_record(self, check_derivatives: bool) -> Record:
-        """Return the record of the finished run, without data after the interruption or the event that ended it."""
+        """Return the record of the finished run, without data after the interruption or event that ended the run."""
         run, recorder, code = self.run, self.recorder, self.code
         t, table = recorder.output()
         stats, store = statistics(run.work.counters, self.cpu_time), self.request.store
@@ -477,7 +476,7 @@ class IntegrationLoop:
         return record_of(Record, DEFAULTS | fields)
 
     def _suspicious_last_step(self, t: Array, table: Array) -> list[TimedState]:
-        """Return [(t, state) before the last step] if v changed in it by more than accelerations explain; else []."""
+        """Return [(t, state) before the last step] if v changed more in it than accelerations explain, else []."""
         run = self.run
         if self.request.times is not None or self.recorder.end_event is not None:
             return []
@@ -486,7 +485,7 @@ class IntegrationLoop:
         return [(float(t[-2]), table[-2])] if has_velocity_jump_at_end(t, table, run.system.n_q) else []
 
     def _suspicious_outputs(self, t: Array, table: Array) -> list[TimedState]:
-        """Return the output states, for a check, if a singular position was near when a step ended at one; else []."""
+        """Return all output states, to be checked, if a step ended at one of them near a singular position, else []."""
         run, request = self.run, self.request
         equal_steps = run.control[run.a.FIXED_STEP] > 0.0 and request.times is None
         if not run.passed_near_singular() or not (

@@ -39,16 +39,16 @@ Array = NDArray[np.float64]
 
 INTERRUPTED, STAGNATED, OUT_OF_TIME = -1, -2, -3  # end codes of a run, in addition to those that `advance` returns
 STAGNATION_STEPS = 20_000  # a run is checked for a stall once per (about) this number of accepted steps
-# A run stalls if its mean step size is below STAGNATION_PACE times its largest step and the rest of the run would take
-# more than STAGNATION_LEFT steps, or if the rest would take more than MAX_STEPS_LEFT steps (days of computing)
+# a run stalls if the rest of the run would take more than MAX_STEPS_LEFT steps (days of computing). It also stalls if
+# the rest would take more than STAGNATION_LEFT steps, and (mean step size) / (largest step size) < STAGNATION_PACE
 STAGNATION_PACE, STAGNATION_LEFT, MAX_STEPS_LEFT = 1e-3, 1e7, 1e11
 
 
 class StallDetector:
     """Monitor of the sizes of accepted steps, to detect a run that makes no progress.
 
-    From the mean size of the last steps follows how many steps the rest of the run takes. The run is stalled if these
-    are more than `max_steps_left`, or more than STAGNATION_LEFT if steps were much longer earlier in the run.
+    The mean size of the last steps yields the number of steps that the rest of the run takes. The run is stalled if
+    this number exceeds `max_steps_left`, or STAGNATION_LEFT if steps were much longer earlier in the run.
     """
 
     def __init__(self, t0: float, max_steps_left: float):
@@ -62,7 +62,7 @@ class StallDetector:
         self.window_n += len(h)
 
     def is_stalled(self, t: float, t1: float) -> bool:
-        """Return whether the rest of the run takes too many steps; only every STAGNATION_STEPS steps, else False."""
+        """Return whether the run takes too many more steps; False unless STAGNATION_STEPS new steps were added."""
         if self.window_n < STAGNATION_STEPS:
             return False
         self.mean_step = (t - self.window_t) / self.window_n
@@ -71,7 +71,7 @@ class StallDetector:
 
     @property
     def has_slowed(self) -> bool:
-        """Whether the steps were much longer earlier in the run."""
+        """Whether steps were much longer earlier in the run, see STAGNATION_PACE."""
         return self.mean_step < STAGNATION_PACE * self.longest_step
 
 
@@ -79,7 +79,7 @@ MAX_SAMPLES = 8  # largest number of sampled states, spread about evenly over th
 N_LAST_STEPS = 8  # number of steps before a sampled state; their median is the step size of the sample
 N_ITERATIONS = 6  # number of power iterations at each sampled state
 # a power iteration starts with the eigenvector at the previous sample, to which INITIAL_FACTOR times a vector without
-# zeros (`initial_direction`) is added: a component that is zero at the start might stay zero
+# zeros (`initial_direction`) is added, because a component that is zero at the start might stay zero
 INITIAL_FACTOR = 0.1
 # in a power iteration x -> J x, the dominant eigenvalue of J is negative if cos(x, J x) is below minus this number
 MIN_ALIGNMENT = 0.9
@@ -97,8 +97,8 @@ class StiffnessSample(NamedTuple):
     v: Array
     a: Array
     h: float  # step size before the state (s)
-    vibration: float  # the method is stable up to this product of step size and angular frequency of a vibration
-    decay: float  # the method is stable up to this product of step size and rate of a decay
+    vibration: float  # the method is stable if (step size) * (angular frequency of a vibration) is at most this
+    decay: float  # the method is stable if (step size) * (rate of a decay) is at most this
 
 
 class StiffnessMonitor:
@@ -116,7 +116,7 @@ class StiffnessMonitor:
         self.last_sizes = last if last.size == N_LAST_STEPS else np.concatenate([self.last_sizes, last])[-N_LAST_STEPS:]
 
     def sample_state(self, t: float, state: Array, n_q: int) -> None:
-        """Store the current state as a sample. In long runs, most calls do nothing, so that samples stay few."""
+        """Store the current state as a sample; in long runs, most calls do nothing, as MAX_SAMPLES samples suffice."""
         if self.plan.stable_to is None or self.last_sizes.size < N_LAST_STEPS:
             return
         self.n_calls += 1
@@ -173,8 +173,7 @@ def _dominant_eigenvalue(
 ) -> tuple[float, bool]:
     """Return |dominant eigenvalue| of dF/dq, or of dF/dv if `by_v`, and whether it is negative, by power iteration.
 
-    F: accelerations of the independent coordinates, whose indices are `independent`. `direction`: first vector of the
-    iteration, overwritten by the eigenvector.
+    F: accelerations of the coordinates `independent` (indices). `direction`: first vector, becomes the eigenvector.
     """
     from twoloop.kernels.evaluation import tasks
 
@@ -202,8 +201,8 @@ def _dominant_eigenvalue(
 MAX_SINGULAR_RATIO = 1e-3
 # a result is not trusted if rounding errors of velocities (or accelerations) exceed this multiple of the tolerances
 MAX_LASTING_ERROR = 100.0
-# the run warns if, at its end, the smallest singular value of the constraint rows is at most this fraction of the
-# largest: then the constraints do not determine the velocities there
+# the run warns if the smallest singular value of the constraint Jacobian at its end is at most this fraction of the
+# largest: then the constraints do not determine the velocities at the end
 MAX_RATIO_AT_END = 1e-6
 # advice if no step leads across a singular position; loose tolerances help, because rounding errors are large near it
 _REMEDIES = (
@@ -225,8 +224,8 @@ _FAILURE_REASONS = {
 def message_of(run: "Run", text: str, system: "ConstrainedSystem") -> dict[str, Any]:
     """Return {"message": text}, or {"later": function} if the text will be computed when it is first read.
 
-    To describe the singular positions that the run crossed takes longer than many runs: so such a text is computed
-    later. Until then `system` must not change, but the arrays of the run may.
+    A description of the singular positions that the run crossed takes longer than many runs: so a text with such a
+    description is computed later. Until then `system` must not change, but the arrays of the run may.
     """
     if CROSSINGS_MARK not in text:
         return {"message": text}
@@ -242,11 +241,10 @@ def message_of(run: "Run", text: str, system: "ConstrainedSystem") -> dict[str, 
 def reject_velocity_jumps(
     run: "Run", last_step: list[TimedState], output_states: list[TimedState], end: float, status: Status, message: str
 ) -> tuple[Status, str]:
-    """Withdraw the success of a run if rounding, or a change of branch, changed velocities near a singular position.
+    """Return RANK_LOST and the reason if rounding or a change of branch changed velocities near a singular position.
 
-    Then return RANK_LOST and a message with the reason, else return `status` and `message`. These states are checked,
-    as far as they are before the time `end`: those before and after crossed positions; `last_step`: [state before the
-    last step] if velocities jumped in it, else []; `output_states`.
+    Else return `status` and `message`. Check states before the time `end`: the states before and after crossed
+    positions, `output_states`, and `last_step` ([state before the last step] if velocities jumped in it, else []).
     """
     end_state, crossings = (float(run.clock[run.a.T]), run.state), [each for each in run.crossings if each[0][0] < end]
     reason = describe_rounding(run, [*(state for ends in crossings for state in ends), *output_states], end)
@@ -266,7 +264,7 @@ def describe_rounding(run: "Run", states: list[TimedState], end: float) -> str:
     system, n = run.system, run.system.n_q
     for t, state in sorted({each[0]: each for each in states}.values(), key=itemgetter(0)):
         q, v = state[:n], state[n : 2 * n]
-        at_singular_start = t == run.t0 and run.starts_singular  # v is given at such a start, not computed
+        at_singular_start = t == run.t0 and run.starts_singular  # there, the user gave v: rounding has not changed it
         if t >= end or at_singular_start or certainly_exceed(run.near_threshold, system.rows(t, q), run.rank):
             continue
         error_ratio = _velocity_error_ratio(run, t, q, v)
@@ -391,7 +389,7 @@ def _describe_contradiction(run: "Run") -> str:
 
 
 def warn_of_singular_end(run: "Run") -> str:
-    """Warn if the constraints lose rank, or nearly so, at the end of a run; return the warning, "" if they do not."""
+    """Warn if the constraints lose or nearly lose rank at the end of a run; return the warning, else ""."""
     if not run.passed_near_singular():
         return ""
     system, n, t = run.system, run.system.n_q, float(run.clock[run.a.T])
@@ -475,7 +473,7 @@ def _describe_near_singular(run: "Run", t1: float) -> str:
 
 
 def describe_not_finite(run: "Run") -> str:
-    """Return a phrase that names the callback whose value is not finite, or says where to look for this callback."""
+    """Return a phrase that names the callback whose value is not finite, or says where callbacks are not finite."""
     kind, fault_time = int(run.work.notes[indices.FAULT_KIND]), float(run.work.notes[indices.FAULT_TIME])
     if kind >= 0:
         name = run.kit.functions._fields[kind]

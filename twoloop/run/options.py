@@ -19,7 +19,7 @@ SMALLEST_TOLERANCE = 1e-15  # rtol or atol must be at least this; else rounding 
 
 @lru_cache(maxsize=1024)
 def _unique_key(*_: Any) -> object:
-    """Return the same object whenever the arguments are equal: a dict finds such a key faster than a tuple of them."""
+    """Return the same object whenever the arguments are equal: a dict finds such a key faster than a tuple."""
     return object()
 
 
@@ -51,18 +51,18 @@ class Options:
 
     @cached_property
     def metadata(self) -> dict[str, Any]:
-        """Fields `method` and `rtol` of a result; and `untested` = None if no step leaves errors of v untested."""
+        """Fields `method` and `rtol` of a result; also `untested`, which is None, if all steps test the errors of v."""
         tested = getattr(self.method, "tested", "all")
         return {"method": self.method.name, "rtol": self.rtol} | ({} if tested == "positions" else {"untested": None})
 
     def set_step_sizes(self, run: Run, t1: float) -> None:
         """Set the first step size and the limits of step sizes (s) of a run that ends at t1, unless steps are fixed."""
-        run.work.notes[indices.NEXT_JUMP] = t1  # no jump of the velocities is known before t1
+        run.work.notes[indices.NEXT_JUMP] = t1  # no jump of velocities before t1 is known yet
         if self.step_size is None:
             run.set_step_sizes(self.first_step, self.max_step, t1)
 
 
-NO_OPTIONS: Any = (None,) * 12, None  # stored arguments and options of the last call; all None before the first call
+NO_CALL: Any = (None,) * 12, None  # in place of the stored (12 arguments, options) of the last call if there was none
 
 
 def options_of(
@@ -84,7 +84,7 @@ def options_of(
 
     If all arguments are the same objects as in the last call, they are not checked again.
     """
-    last_arguments, options = system.shared.get("options", NO_OPTIONS)
+    last_arguments, options = system.shared.get("options", NO_CALL)
     m, r, a, first, longest, most, size, dense, shows, limit, checks, code = last_arguments
     # compare without a loop, which would take a tenth of the time of a short repeated call
     same = m is method and r is rtol and a is atol and first is first_step and longest is max_step and most is max_steps

@@ -66,12 +66,12 @@ class SharedSetup:
             raise ValueError("its numbers differ from the values of the traced expressions")
 
     def region(self, with_derivatives: bool) -> CheckedRegion:
-        """Return the region of states where runs have compared callbacks (derivatives, too, if `with_derivatives`)."""
+        """Return the region of states where callbacks (if `with_derivatives`, also derivatives) agreed with traces."""
         return self._regions.setdefault(with_derivatives, CheckedRegion())
 
 
 class ParametricRun:
-    """Run that integrates systems one after another; they differ only in parameters, see `use_parameters_of`.
+    """Run that integrates systems which differ only in parameters, one after another, see `use_parameters_of`.
 
     `run`: a copy of the run in `shared`, at its start. `current_system`: the system whose parameters the arrays contain
     now. `system`: a copy of `current_system` that uses these arrays, and has a cache of its own.
@@ -152,5 +152,5 @@ def _values_of_plan(plan: Plan) -> Iterator[Any]:
             yield from _values_of_plan(value)
         elif name == "traced":
             yield [part.tobytes() for each in value for part in each.program[:-1]]
-        elif name != "stable_to":  # `stable_to` is a lambda: it differs even between equal plans
+        elif name != "stable_to":  # `stable_to` is a lambda, which differs even between equal plans
             yield value.tobytes() if isinstance(value, np.ndarray) else value

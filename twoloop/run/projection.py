@@ -1,7 +1,7 @@
 """Project a guess onto the constraints (`consistent_state`); report how far the guess moved, and its assembly.
 
-Large systems are projected by sparse factors, but by dense ones in three cases: rows of C_q are dependent at consistent
-positions, but only nearly dependent at the guess; a dead centre is near; the guess may lead to another assembly.
+Large systems are projected by sparse factors. Dense factors are used in three cases: rows of C_q are dependent at
+consistent positions, but only nearly dependent at the guess; a dead centre is near; the assembly is not certain.
 """
 
 from __future__ import annotations  # so that help() shows the name ArrayLike
@@ -30,10 +30,10 @@ from twoloop.run.workspace import fixed_order_form, make_kit, workspace
 Array = NDArray[np.float64]
 
 MIN_SINE = 1e-5  # a dead centre is near if sin(angle between a row of C_q and the span of other rows) is below this
-# MAX_CORRECTIONS: largest number of Newton iterations; they end when a correction is at most ROUNDING times max|q|
+# MAX_CORRECTIONS: largest number of Newton iterations. The iteration ends if a correction is at most ROUNDING * max|q|
 MAX_CORRECTIONS, ROUNDING = 25, 1e-14
-# C_q predicts, to first order, where a displaced guess is projected. If this is wrong by more than this fraction of the
-# displacement, the guess may lead to another assembly
+# C_q predicts, to first order, where a displaced guess is projected. If the prediction is wrong by more than this
+# fraction of the displacement, the guess may lead to another assembly
 MAX_NONLINEARITY = 0.5
 
 
@@ -56,7 +56,7 @@ class _SparseProjection:
         return int(entry_point(self.kit.inner)(self.kit, self.work, task, self.t, q, v, 0.0, a, lam))
 
     def allowed_part(self, displacement: Array) -> Array:
-        """Return the displacement (n_q,) without the component that would violate C_q at `self.position`."""
+        """Return a displacement (n_q,) projected onto those that C_q at `self.position` allows."""
         rows = self.system.sparse_rows(self.t, self.position)
         change = np.zeros(len(displacement))
         zero, residual = np.zeros(len(displacement)), np.ascontiguousarray(rows @ displacement)
@@ -99,8 +99,8 @@ class Dependence(NamedTuple):
     """Rank of C_q of a large system at a position, and the rows that depend on others."""
 
     rank: int
-    coefficients: dict[int, Array]  # for each dependent row: x (n_c,) with row = x @ C_q, 0 at dependent rows
-    allowed_move: Array  # random displacement (n_q,) that C_q allows; its largest entry is 1 unit of a coordinate
+    coefficients: dict[int, Array]  # for each dependent row: x (n_c,) with row = x @ C_q; x is 0 at dependent rows
+    allowed_move: Array  # random displacement (n_q,) that C_q allows; the largest entry is 1 unit of a coordinate
     project_nearby: Callable[[Array], Array | None]  # projects a position near q; returns None on failure
 
 
@@ -166,9 +166,9 @@ def project_sparsely(
 def _nearby_guesses_match(projection: _SparseProjection, position: Array, change: Array) -> bool:
     """Return whether three guesses near a projected `position` lead to the same assembly as the user's guess.
 
-    `change`: displacement of the user's guess by its projection. The guesses are displaced from `position` by -2
-    `change`, and by two random vectors of at most max|change|. They lead to the same assembly if the linearized
-    constraints predict where they are projected.
+    `change`: displacement of the user's guess by its projection. The three guesses are displaced from `position` by -2
+    `change`, and by two random vectors of at most max|change|. A guess leads to the same assembly if the linearized
+    constraints predict where it is projected.
     """
     distance = float(np.abs(change).max())
     directions = np.random.default_rng(8).uniform(-1.0, 1.0, (2, len(position)))
@@ -184,17 +184,14 @@ def _nearby_guesses_match(projection: _SparseProjection, position: Array, change
 
 
 MAX_ITERATIONS = 50  # largest number of Gauss-Newton iterations
-# the iteration ends if the violation is at most this fraction of the one allowed at a start, and has not been halved by
-# the last step (rounding prevents a smaller one)
+# the iteration ends if violation / (violation allowed at a start) is at most this, and the last step has not halved it
 CONVERGED_VIOLATION = 1e-2
-# singular values of C_q count as zero below these fractions of the largest one. RANK_CUTOFF: to determine ranks.
-# LSTSQ_CUTOFF: in least-squares solutions. REDUNDANT_CUTOFF: in least-squares solutions with redundant rows
+# singular values of C_q count as zero below these fractions of the largest one. RANK_CUTOFF: for ranks. LSTSQ_CUTOFF:
+# for least-squares solutions. REDUNDANT_CUTOFF: for least-squares solutions with redundant rows
 RANK_CUTOFF, LSTSQ_CUTOFF, REDUNDANT_CUTOFF = 1e-10, 1e-13, 1e-2
 # a dead centre is near if the ratio of the smallest to the largest singular value of C_q is at most this
 DEAD_CENTRE_RATIO = 0.01
-# two projected guesses end at the same position if their distance is at most this fraction of the largest change that
-# the projection has made
-MAX_EQUAL_DISTANCE = 0.1
+MAX_EQUAL_DISTANCE = 0.1  # projected guesses are equal if (distance) / (largest change by projection) is at most this
 MAX_CHANGE = 1e8  # the iteration has diverged if a coordinate changes by more than this, in its unit (`Scales.columns`)
 
 
@@ -343,7 +340,7 @@ def _projected_position(
 ) -> Array:
     """Return a guess projected by changes of its `free` coordinates; raise ValueError on failure.
 
-    It is also a failure if another assembly may be as near as the projected position.
+    If `check_assembly`, the projection also fails if another assembly may be as near as the projected position.
     """
     jacobian = system.jacobian(t, guess)
     scales = scales_of(system, t, guess, jacobian)
@@ -368,7 +365,7 @@ def _projected_position(
             f"is nearer to an assembled position{_describe_rank_loss(scales, jacobian, free, kept)}"
         )
     shift = float((np.abs(position - guess) / scales.columns).max())
-    if check_assembly and (violation.excess > 1.0 or shift > CONSISTENT):  # even a small violation may move q far
+    if check_assembly and (violation.excess > 1.0 or shift > CONSISTENT):  # q may move far although C is almost zero
         ending = _describe_other_assembly(system, t, position, guess, free, scales, cutoff)
         if ending is not None:
             jacobian_there = system.jacobian(t, position)
@@ -388,9 +385,9 @@ def _describe_other_assembly(
     """Check whether guesses as far from the projected position q1 as `guess` may lead to another assembly.
 
     Return None if they do not, else a phrase on a guess that may. A guess leads to the same assembly if it is projected
-    to about the point that C_q predicts to first order, and the determinant of the dependent columns keeps its sign. If
-    not, q1 is reconstructed from the result: if another position with the same independent coordinates is found, it is
-    on another assembly.
+    to about the point that C_q predicts to first order, and the determinant of the dependent columns keeps its sign.
+    Else, Newton's method starts from the independent coordinates of q1 and the dependent ones of the projected guess:
+    if it does not lead back to q1, there is another assembly.
     """
     scaled_move = (q1 - guess) / scales.columns
     largest_move = float(np.abs(scaled_move).max())
@@ -415,7 +412,7 @@ def _describe_other_assembly(
         if distance(projected, expected) <= MAX_NONLINEARITY * float(np.abs(move).max()) and sign_at(projected) == sign:
             continue
         # the prediction may be inaccurate only because constraints are curved. Then q1 with the dependent coordinates
-        # of `projected` is projected back to q1; on another assembly, it stays there
+        # of `projected` is projected back to q1; if not, `projected` is on another assembly
         mixed = q1.copy()
         mixed[dependent_columns] = projected[dependent_columns]
         mixed_projected, excess, _ = _gauss_newton(system, t, mixed, np.array(dependent_columns, dtype=int), cutoff)
@@ -519,7 +516,7 @@ def _describe_rank_loss(scales: Scales, jacobian: Array, free: NDArray[np.intp],
 def _describe_no_freedom(
     system: ConstrainedSystem, t: float, scaled: Array, free: NDArray[np.intp], kept: list[int], why: str
 ) -> str:
-    """Return the message for a projection that fails because the columns of the `free` coordinates lack rank."""
+    """Return the message for a projection that fails because the columns of C_q for `free` coordinates lack rank."""
     ranks = f"rank {_rank(scaled[:, free])} of {len(scaled)}"
     name = "C_q" if len(scaled) == system.n_c else "[C_q; A], whose rows contradict one another at these velocities,"
     if not kept:

@@ -34,13 +34,13 @@ STEP_ARRAYS = ("h", "rejected_error", "rejected_convergence", "partitioned", "un
 class MemoryStore:
     """Store of named arrays in memory; an array is a list of parts until it is read."""
 
-    append_only = False  # whether stored rows cannot be changed, and so must be complete when they are added
+    append_only = False  # True if stored rows can never be changed: then rows must be complete when they are added
 
     def __init__(self) -> None:
         self._parts: defaultdict[str, list[NDArray[Any]]] = defaultdict(list)
 
     def add(self, name: str, part: NDArray[Any]) -> None:
-        """Append rows to an array; the part may be stored without a copy."""
+        """Append rows to an array, perhaps without a copy of `part`: the caller must not change `part` any more."""
         self._parts[name].append(part)
 
     def truncate(self, name: str, n: int) -> None:
@@ -90,7 +90,7 @@ class FileStore:
         return int(dtype.itemsize * np.prod(width, dtype=np.int64))
 
     def _write_header(self, file: Any, name: str, dtype: np.dtype[Any], shape: tuple[int, ...]) -> None:
-        """Write the header of a file, after its rows: until this is done, the file still contains the old array."""
+        """Write the header of a file after its rows: until the header is written, the file contains the old array."""
         header = repr({"descr": dtype.str, "fortran_order": False, "shape": shape})
         header = header.ljust(HEADER_SIZE - len(MAGIC) - 3) + "\n"
         file.flush()
@@ -116,21 +116,21 @@ def read_arrays(folder: Path) -> dict[str, NDArray[Any]]:
 
 Array = NDArray[np.float64]
 
-MAX_PENDING_STATES = 1024  # when more states than this wait, their intervals are searched for events and output times
+MAX_PENDING_STATES = 1024  # when more states than this are pending, intervals are searched for events, output times
 
 
 class OutputRequest(NamedTuple):
     """Requested output of a run."""
 
     times: Array | None = None  # output times; None: the ends of all accepted steps
-    ends_at_outputs: bool = False  # whether steps end at all output times; if not, states there are interpolated
+    ends_at_outputs: bool = False  # whether steps end at all output times; if not, states at these are interpolated
     dense: bool = False  # whether dense output, `result.sol`, is requested
     events: list[Event] | None = None  # events to be searched for; None: no events were requested
     store: Any = None  # `MemoryStore` or `FileStore` to which the output is added; None: a new MemoryStore
 
     @property
     def interpolated_times(self) -> Array | None:
-        """Output times, if states there must be interpolated; None if steps end at all of them, or there are none."""
+        """Output times at which states must be interpolated; None if there are none, or if steps end at all of them."""
         return None if self.ends_at_outputs else self.times
 
     @property
@@ -147,8 +147,8 @@ class OutputRequest(NamedTuple):
 class Recorder:
     """Recorder of the states of accepted steps, which it receives in chunks (steps of one call of compiled code).
 
-    A step is searched for events only when later states that its polynomial interpolates are known, too: so results do
-    not depend on the size of chunks. Event functions are evaluated at least every `max_gap` seconds.
+    The polynomial of a step also interpolates later states. The step is searched for events only when these are known:
+    so results do not depend on the size of chunks. Event functions are evaluated at least every `max_gap` seconds.
     """
 
     def __init__(
@@ -195,7 +195,7 @@ class Recorder:
             self._rows[-1, : len(row)] = row
 
     def store_crossing(self, memory: Array) -> None:
-        """If a crossing step's `memory` contains a polynomial, copy it for the interval after the last state."""
+        """If a crossing step's `memory` contains a polynomial, copy `memory` for the interval after the last state."""
         from twoloop.kernels.steps.crossing_step import END, N_STORED
 
         if self.interpolator is not None and memory[-N_STORED:][END] > -np.inf:
@@ -215,7 +215,7 @@ class Recorder:
             store.add("sol_kinds", kinds)
 
     def _store_states(self, t: Array, rows: Array) -> None:
-        """Store times and rows [q, v, a, lam]; [a, lam] may be missing from interpolated rows, and is added later."""
+        """Store times and rows [q, v, a, lam]; interpolated rows may be only [q, v], and are completed later."""
         self.request.store.add("t", t)
         self.request.store.add("states", self._complete_rows(t, rows) if self.request.store.append_only else rows)
 
@@ -228,7 +228,7 @@ class Recorder:
 
     @property
     def interrupted_at(self) -> float | None:
-        """Time at which the result ends because Ctrl-C interrupted the search for events; None if it did not."""
+        """Time at which the result ends because Ctrl-C interrupted the search for events; None: no interruption."""
         ended_early = self.interrupted and self.search is not None and self.end_event is None
         return self.search.reached if ended_early and self.search is not None else None
 
@@ -238,7 +238,7 @@ class Recorder:
         return None if self.search is None else self.search.ended
 
     def search_intervals(self, end: int | None = None) -> None:
-        """Search intervals up to the state with index `end` (None: last) for events; store states at output times."""
+        """Search the intervals before pending state `end` (None: the last) for events; store states at output times."""
         end = len(self._t) - 1 if end is None else end
         interpolator = self.interpolator
         if interpolator is None or self.end_event is not None or self.interrupted:
@@ -506,7 +506,7 @@ _new_object, _set_fields = object.__new__, vars(Record)["__dict__"].__set__
 
 
 class _Deferred:
-    """Descriptor of a field of a record: at its first access, compute a missing value by `vars(record)["later"]`."""
+    """Descriptor of a field of a record: when a missing value is first read, compute it by `vars(record)["later"]`."""
 
     def __init__(self, name: str):
         self.name = name
@@ -520,7 +520,7 @@ class _Deferred:
 
 
 DEFAULTS = {each.name: each.default for each in fields(Record) if each.default is not MISSING}
-for _field in fields(Record):  # not in the class, where `dataclass` would take descriptors for defaults
+for _field in fields(Record):  # after the class: within the class, `dataclass` would take descriptors for defaults
     setattr(Record, _field.name, _Deferred(_field.name))
 
 
@@ -528,8 +528,8 @@ Integers = NDArray[np.int64]
 
 COUNT_NAMES = [each.name for each in fields(Statistics) if each.name != "cpu_time"]
 GET_COUNTS = itemgetter(*(getattr(indices, name.upper()) for name in COUNT_NAMES))
-# three counts before the first step: steps rejected by the error test; steps rejected as an iteration did not converge;
-# partitions (one, as the first is chosen at the start)
+# three counts before the first step: steps rejected by the error test; steps rejected because an iteration did not
+# converge; partitions (one, chosen at the start)
 INITIAL_COUNTS = np.array([0, 0, 1])
 
 
@@ -556,7 +556,7 @@ def state_fields(n: int, t: Array, table: Array) -> dict[str, Array]:
 
 
 def interval_kinds(run: "Run", steps: Array) -> Integers:
-    """Return the kind of each step of the run's own method: a code that says which data dense output interpolates."""
+    """Return the kinds of `steps` of the run's own method: codes that say which data dense output interpolates."""
     if run.plan.separate:
         return np.full(len(steps), indices.SEPARATE)
     explicit_kind = indices.ACROSS if run.substituted else indices.ACCELERATIONS

@@ -27,7 +27,7 @@ from twoloop.run.run import Run
 
 Array = NDArray[np.float64]
 
-FIRST_FORCE = "first force"  # `system.derived` has the force at the start under this key, if `force` is not traced
+FIRST_FORCE = "first force"  # key of `system.derived`: value of an untraced `force` at the start of a run
 N_DERIVATIVES = 4  # number of states of a run at which derivatives are checked after the run, including the last state
 
 
@@ -52,7 +52,7 @@ def check_callbacks_along_run(
     """After a run, compare callbacks with their traces at states of the run; return its final status and message.
 
     If all callbacks are right, return `status` and `message`; else another status, and a message that begins with the
-    difference. Python forces are called twice, and must return the same value. If `check_derivatives`, derivatives are
+    difference. Python forces are called twice, and must return equal values. If `check_derivatives`, derivatives are
     compared with exact ones, or with finite differences. `end`: time at which the run ended.
 
     `is_due`: if True, compare at all states that `states(True)` returns (rows [t, q, v], latest first). If False,
@@ -183,7 +183,7 @@ def _change_text(name: str, t: float, entry: int, first_value: float, second_val
 
 
 CHUNK_ATTEMPTS = 256  # largest number of attempted steps in one call of `advance`
-FIRST_FRACTION = 0.1  # first step size / duration of a piece; a later piece begins with the last proposed step size
+FIRST_FRACTION = 0.1  # (first step size) / (duration of a piece), unless the last piece has proposed a step size
 MAX_BUFFER_SIZE = 100_000  # largest number of floats in the buffer of states
 
 

@@ -40,14 +40,14 @@ from twoloop.run.workspace import add_newton_program, fixed_order_form, kit_for_
 Array = NDArray[np.float64]
 Buffers = tuple[Array, Array, Array]  # times, states and steps
 
-# largest number of attempted steps in the first chunk (call of compiled code) of a small system. After each chunk,
-# checks in Python take 0.2 ms, a large part of the time of a shorter chunk
+# largest number of attempted steps in the first chunk (call of compiled code) of a small system. Each chunk is followed
+# by checks in Python, which take 0.2 ms: much compared with the time of a shorter chunk
 FIRST_CHUNK = 1024
 FIRST_CHUNK_IN_PYTHON = 64  # largest number of steps in the first chunk if callbacks are (slow) Python functions
-SMALL_SYSTEM = 32  # largest number of coordinates of a small system; larger systems have proportionally smaller chunks
-TRIAL_STEPS = 10  # a method on trial (fast only with long steps) is replaced if one of its first 10 steps is short
-NO_PATTERN = np.zeros((0, 0))  # instead of the nonzero pattern of constraint rows, in the fixed-order form
-# constraints contradict one another if accelerations violate a row of C_q a = gamma by more than this * sum of |terms|
+SMALL_SYSTEM = 32  # largest number of coordinates of a small system; chunks of larger ones are proportionally smaller
+TRIAL_STEPS = 10  # a method that is fast only with long steps is replaced if one of this many first steps is short
+NO_PATTERN = np.zeros((0, 0))  # empty pattern of constraint rows, for the fixed-order form, which has its own
+# constraints contradict each other if accelerations a violate a row of C_q a = gamma by more than this * sum of |terms|
 CONTRADICTION = 1e-6
 
 
@@ -83,7 +83,7 @@ class Run:
         self.kit = make_kit(system, t0, q0, plan, self.fixed_order)
         n_rows = system.n_c + system.n_a
         self.state = np.concatenate([q0, v0, np.zeros(system.n_q + n_rows)])
-        # ranks of constraint rows at this start are not known yet: make the workspace for the ranks at the last start
+        # the ranks of constraint rows at this start are not known yet: first try those at the last start
         self.work = self._make_workspace(*(system.derived.get("ranks", ()) if self.fixed_order is None else ()))
         self.new_state = np.zeros_like(self.state)
         self.tolerances = np.zeros(indices.ATOL + system.n_q)
@@ -96,7 +96,7 @@ class Run:
         self.control[loop_state.FIXED_STEP] = 0.0 if step_size is None else step_size
         self.control[loop_state.MAX_STEPS] = np.inf
         self.control[loop_state.MAY_CROSS], self.control[loop_state.SAMPLE_MOTION] = self.fixed_order is None, 1.0
-        rate_kinds = system.given.keys() & {"constraint_rate", "nonholonomic_rate"}  # empty: C_t = b = 0
+        rate_kinds = system.given.keys() & {"constraint_rate", "nonholonomic_rate"}  # callbacks for the rates C_t and b
         self.control[loop_state.MAY_JUMP] = bool(rate_kinds)
         first_chunk = FIRST_CHUNK_IN_PYTHON if system.called_in_python else FIRST_CHUNK
         self.chunk = max(1, first_chunk // max(1, system.n_q // SMALL_SYSTEM))  # largest number of attempts in a chunk
@@ -104,7 +104,7 @@ class Run:
         self._reset_clock(t0)
         self.write_step_control(plan)
         self.substituted = False  # whether `plan.substitute` has replaced the first plan
-        self.near_threshold = singular_threshold(rtol)  # smallest / largest pivot below it: near a singular position
+        self.near_threshold = singular_threshold(rtol)  # near a singular position, pivots of C_q have a lower ratio
         force_traced = any("force" in each.kinds for each in plan.traced)
         short_and_steep = system.remembered(
             ("changes", force_traced),
@@ -119,7 +119,7 @@ class Run:
         self.mirrored_size = 0.0  # size (s) of a step from before a singular position to as far beyond it
         self.crossing_tolerances = self.tolerances  # tolerances of steps across singular positions
         self.sizes_to_try: list[float] = []  # step sizes (s) still to be tried across a singular position
-        self.attempts_left = np.inf  # number of failed attempts after which the search for a step across it ends
+        self.attempts_left = np.inf  # the search for a step across a singular position ends after so many failures
         self.crossing_size = 0.0  # size (s) of the last attempted step across a singular position
         self.piece_ends: list[float] = []  # ends (s) of next steps on a polynomial across a singular position
         self.origins: list[Any] = []  # `Origin` of each polynomial still to be tried across a singular position
@@ -127,9 +127,9 @@ class Run:
         self.starts_singular = False  # whether the start is a singular position: C_q has a higher rank beside it
         self.branch_known = False  # whether it is known on which branch the motion leaves a singular start
         self.jumps: list[float] = []  # times (s) at which velocities jumped because C_t, or b in A v + b = 0, jumped
-        self.compared_until = [-np.inf]  # callbacks and traces were compared up to this time; copies share this list
-        self.region: CheckedRegion | None = None  # where callbacks and traces were compared; None: in the system
-        self.varied_parameters: Array | None = None  # parameters, if systems that differ in them share this run
+        self.compared_until = [-np.inf]  # time until which callbacks were compared with traces; copies share the list
+        self.region: CheckedRegion | None = None  # where callbacks agreed with traces; None: the system's region
+        self.varied_parameters: Array | None = None  # parameters in which systems that share this run differ
         self._compute_start_accelerations()
         self.rank = len(self.work.rows_v)
         self.descriptions: dict[tuple[int, ...], str] = {}  # cached warnings; the keys are indices of redundant rows
@@ -216,7 +216,7 @@ class Run:
             jumps=[],
         )
         new_run.crossing_tolerances = new_run.tolerances
-        # kernels may change the flags of the kit in the augmented form: the copy needs a kit of its own
+        # in the augmented form, kernels may change the flags of the kit: so the copy needs a kit of its own
         if self.fixed_order is None and self.kit.flags[indices.FORM] == indices.AUGMENTED:
             new_run.kit = kit_for_plan(self.system, self.kit.flags, new_run.plan)
         return new_run
@@ -373,7 +373,7 @@ class Run:
         n = self.system.n_q
         a, gamma = self.state[2 * n : 3 * n], self.work.Gamma
         residual = np.abs(rows @ a - gamma)
-        if residual.max() <= CONTRADICTION:  # then it is within the limit of each row
+        if residual.max() <= CONTRADICTION:  # below the limits of all rows, which are at least CONTRADICTION
             return np.zeros(0, dtype=np.int64)
         return np.flatnonzero(residual > CONTRADICTION * np.maximum(abs(rows) @ np.abs(a) + np.abs(gamma), 1.0))
 
@@ -399,9 +399,9 @@ class Run:
         self.control[self.a.SHORTEST] = cached_run().SHORTEST_STEP * first_size
 
     def limit_steps(self) -> None:
-        """Limit step sizes, so that forces are evaluated at least every hundredth of the run: short ones are seen.
+        """Limit step sizes so that forces are evaluated at least every hundredth of the run, to detect short forces.
 
-        If forces may be steep, even the step size is at most this time, as one evaluation may not reveal them.
+        If forces may be steep, a single evaluation may not detect a short one: then step sizes are at most this time.
         """
         gap = 1.0 if self.forces_may_be_steep else self.plan.max_gap
         max_size = np.inf if self.plan.evaluates_within else self.tolerances[indices.GAP] / gap
@@ -424,7 +424,7 @@ class Run:
 
         Rounding may have changed velocities there.
         """
-        # pivots of the fixed-order form vary more, so that a larger one does not show a singular position
+        # pivots of the fixed-order form vary more: there, only a ratio below SMALL_PIVOT shows a singular position
         threshold = self.near_threshold if self.fixed_order is None else SMALL_PIVOT
         return bool(self.clock[self.a.PIVOT_AT_OUTPUT] < threshold)
 

@@ -64,7 +64,7 @@ class SampledRun:
     """Integrate step by step between sampling times; the parameters of forces may change at these times.
 
     `set_parameters` overwrites parameters of `system`, so `system` must not be used elsewhere. Raise TypeError or
-    ValueError if the start is invalid; also for Taylor and Lobatto16: their generated code has fixed parameters.
+    ValueError if the start is invalid, or for Taylor and Lobatto16, whose generated code has fixed parameters.
     """
 
     def __init__(
@@ -173,7 +173,7 @@ class SampledRun:
             self._integrate_to(end)
             if not may_have_missed_changes(self.run):
                 return
-            if len(self.times) > 1:  # earlier calls of `step` may have missed some, too: warn
+            if len(self.times) > 1:  # earlier calls of `step`, not repeated, may also have missed short changes: warn
                 warn_of_missed_changes(self.run)
             self._max_gap = gap_for_repetition(self.run)
             self._return_to_sample()
@@ -184,7 +184,7 @@ class SampledRun:
         """Integrate once from the last stored state to the time `end`."""
         run, a, clock = self.run, self.run.a, self.run.clock
         t = self.times[-1]
-        # Python callbacks may read variables that have changed since the last call of `step`: evaluate them anew
+        # Python callbacks may use variables that have changed since the last call of `step`: evaluate callbacks anew
         if self._parameters_changed or self.system.called_in_python:
             self._restart(t)
         run.choose_first_step(self.t0, end, run.state, run.max_step)
@@ -256,7 +256,7 @@ class SampledRun:
         self._parameters_changed = False
 
     def _finish_by_loop(self, end: float) -> None:
-        """Let IntegrationLoop integrate to `end`, as `advance` has stopped before; raise RuntimeError on failure."""
+        """Integrate to `end` by IntegrationLoop, because `advance` stopped earlier; raise RuntimeError on failure."""
         run = self.run
         run.t0, run.start_warning = float(run.clock[run.a.T]), ""
         interrupts = Interrupts().install_handlers()
@@ -279,7 +279,7 @@ class SampledRun:
         self._parameters_changed = True
 
     def _check_enters_forces_only(self, index: int, value: float) -> None:
-        """Raise ValueError if a parameter (new: `value`) affects other callbacks than forces: the state would jump."""
+        """Raise ValueError if a new `value` of a parameter changes other callbacks than forces: states would jump."""
         old_value, n = float(self.p[index]), self.system.n_q
         t, row = self.times[-1], self.rows[-1]
         state = {"q": row[:n], "v": row[n : 2 * n]}

@@ -84,7 +84,7 @@ class SignalHandlers:
 
 
 def signals_of(system: ConstrainedSystem) -> SignalHandlers:
-    """Return a context for code that catches exceptions of callbacks: those of signal handlers are not lost in it."""
+    """Return a context for code that catches exceptions of callbacks, so that those of signal handlers are not lost."""
     return SignalHandlers(ctrl_c=system.called_in_python)
 
 

@@ -1,9 +1,8 @@
 """Describe singular positions: where steps crossed them, and how uncertain the motion is near them.
 
 "Rows" are the rows of the constraint Jacobian: C_q, then A of the non-holonomic constraints A v + b = 0. Let s be the
-smallest singular value of this matrix, and d the right singular vector of s. If constraints have rounding errors eps,
-they determine q along d only to eps / s. As an error of q changes the rows, velocities along d have errors of about
-eps / s^2.
+smallest singular value of this matrix, and d its right singular vector. Constraints with rounding errors eps determine
+q along d only to eps / s. This error of q changes the rows: so velocities along d have errors of about eps / s^2.
 """
 
 from collections.abc import Callable, Iterator
@@ -22,25 +21,24 @@ TimedState = tuple[float, Array]  # time and state [q, v, ...]
 Crossings = list[list[TimedState]]
 Ratio = Callable[[ConstrainedSystem, float, Array, int], float]
 
-# messages say that constraints lose rank if (smallest / largest singular value) of their Jacobian is below this
+# messages say that constraints lose rank if (smallest / largest singular value) of the Jacobian is below this
 LOST_RANK_RATIO = 1e-2
 N_POSITIONS = 33  # the least singular value between two states is searched for at this number of positions
 MAX_SHOWN = 3  # largest number of singular positions in a message
 # displacement of q in finite differences of constraint equations and their Jacobian, relative to the largest coordinate
 DISPLACEMENT = 1e-6
-# rows of the Jacobian are scaled to the norm 1. Exception: a row that is small at this position only. Its divisor is
-# MIN_ROW_NORM times the norm that its derivative yields for positions nearby
+# each row of the Jacobian is divided by its norm. But a row that is small at this position only is divided by
+# MIN_ROW_NORM times its norm at positions nearby, which is estimated by its derivative
 MIN_ROW_NORM = 0.1
-# velocities have jumped in a step if they change by more than JUMP_RATIO times (step size * acceleration), and by more
-# than MIN_JUMP times the tolerances
+# velocities have jumped in a step if their change exceeds JUMP_RATIO * step size * acceleration and MIN_JUMP tolerances
 JUMP_RATIO, MIN_JUMP = 3.0, 10.0
 
 
 def describe_crossings(system: ConstrainedSystem, crossings: Crossings, end_state: TimedState, rank: int) -> str:
     """Return sentences about the singular positions that steps crossed, for the message of a result.
 
-    `crossings`: for each position the states before and after it. If the run ended before the crossing was complete,
-    the state after it is missing; then the last state of the run, `end_state`, replaces it. `rank`: of the Jacobian.
+    `crossings`: for each position, the states before and after it; if a run ended within a crossing, its last state
+    `end_state` replaces the missing state after it. `rank`: rank of the constraint Jacobian in the rest of the run.
     """
     ratios = {
         ends[0][0]: _least_ratio_between(system, ends[0], [*ends, end_state][1], rank) for ends in crossings[:MAX_SHOWN]
@@ -141,7 +139,7 @@ def has_velocity_jump_at_end(times: Array, rows: Array, n: int) -> bool:
 
 
 def _crossing_ends(crossings: Crossings, end_state: TimedState) -> Iterator[tuple[TimedState, TimedState, bool]]:
-    """Yield for each position the states before and after it; and True if special steps, not ordinary ones, crossed."""
+    """Yield (state before, state after, whether the position was crossed by special steps) for each position."""
     before: TimedState | None = None
     for first, *after in crossings:
         before = first if before is None else before
@@ -166,10 +164,10 @@ def _largest_acceleration(system: ConstrainedSystem, t: float, q: Array, v: Arra
 
 
 def scaled_to_unit_masses(system: ConstrainedSystem, t: float, q: Array) -> tuple[Array, Array, Array, Array]:
-    """Return the scaled M, the scaled constraint Jacobian, divisors of its rows, and units of coordinates.
+    """Return M and the constraint Jacobian for scaled coordinates and rows, the divisors of rows, and the units.
 
-    The units of coordinates make the diagonal entries of M 1, and the divisors give rows the norm 1. If a row is small
-    at this position only, its divisor is larger, see MIN_ROW_NORM.
+    The units (of coordinate j: 1 / sqrt(M_jj)) make the diagonal entries of M 1. With the divisors, all rows of the
+    Jacobian have the norm 1, except for rows that are small at this position only, see MIN_ROW_NORM.
     """
     mass, rows = system.mass(t, q), system.rows(t, q)
     inertia = np.abs(np.diagonal(mass))
@@ -227,7 +225,7 @@ def velocity_rounding_errors(system: ConstrainedSystem, t: float, q: Array, v: A
             row_slopes = np.abs(np.subtract(*(system.rows(t, each) for each in displaced)))
         except (ArithmeticError, ValueError):  # a square root, for example, fails beyond a dead centre
             return np.full(len(q), np.nan)
-        # rounding errors of constraints: those of q, times entries of the Jacobian near q (at q, some may be small)
+        # rounding errors of constraints: rounding errors of q times Jacobian entries near q (at q, some may be small)
         nearby_rows = np.abs(rows) + (row_slopes * (np.abs(rows).max() / row_slopes.max()) if row_slopes.any() else 0.0)
         rounding = ROUNDING * np.sqrt((nearby_rows * nearby_rows) @ (q * q))
         errors = np.maximum(
@@ -237,7 +235,7 @@ def velocity_rounding_errors(system: ConstrainedSystem, t: float, q: Array, v: A
 
 
 def describe_singular_start(system: ConstrainedSystem, t: float, q: Array, rank: int, rtol: float, atol: Array) -> str:
-    """Return a warning if the start q may, within tolerances, be a singular position, else ""; `rank`: of C_q and A."""
+    """Return a warning if a singular position may be within tolerances of the start q, else ""; `rank`: of [C_q; A]."""
     if rank == 0 or certainly_exceed(WEAK_RATIO, system.rows(t, q), rank):
         return ""
     ratio = singular_ratio(system, t, q, rank)
@@ -257,8 +255,8 @@ def describe_singular_start(system: ConstrainedSystem, t: float, q: Array, rank:
 def _displacement_to_singular_position(system: ConstrainedSystem, t: float, q: Array, rank: int) -> Array:
     """Estimate the displacement (n_q,) from q to the nearest singular position; return NaN or infinity if unknown.
 
-    It is a Newton step towards a zero of the smallest singular value of the Jacobian. Its direction is the gradient of
-    this value, without components along the other right singular vectors, which would violate constraints.
+    The result is a Newton step towards a zero of the smallest singular value of the Jacobian. The step's direction is
+    the gradient of this value without components along other right singular vectors, which would violate constraints.
     """
     left, values, right = np.linalg.svd(system.rows(t, q))
     u, w, other_directions = left[:, rank - 1], right[rank - 1], right[: rank - 1]

@@ -26,8 +26,7 @@ CHANGE_PER_SAMPLE = 3e-3  # relative change of C_q between two successive sample
 WEIGHTS = np.array([[1.0, -8.0, 0.0, 8.0, -1.0], [-1.0, 16.0, -30.0, 16.0, -1.0]]) / 12.0
 # assumed relative error of finite differences: a derivative of C_q below this fraction of C_q is taken for zero
 MAX_DIFFERENCE_ERROR = 1e-8
-# some singular values of C_q are zero at the start. The rank of C_q rises along the motion if one of them changes: if
-# its time derivative, divided by the norm of dC_q/dt, exceeds this
+# the rank of C_q rises along the motion if (ds/dt) / |dC_q/dt| exceeds this; s: a singular value, zero at the start
 MIN_RANK_DERIVATIVE = 1e-6
 # the time derivative of a singular value that is zero at the start is certainly not zero if it exceeds this number
 # times its uncertainty, which is the norm of dC_q/dt for a velocity as large as the tolerances
@@ -44,7 +43,7 @@ MAX_RESIDUAL = 1e-6  # largest residual allowed in the equations for the acceler
 class Branch(NamedTuple):
     """Branch of the motion through a singular position.
 
-    `a`: accelerations (n_q,) there. `q`, `v`: a nearby state on the branch; `rank`: rank of C_q at this state.
+    `a`: accelerations (n_q,) at this position. `q`, `v`: a nearby state on the branch; `rank`: rank of C_q at `q`.
     `first_size`: first step size (s) to try.
     """
 
@@ -58,10 +57,10 @@ class Branch(NamedTuple):
 def branch_at(system: ConstrainedSystem, t: float, state: Array, rank: int, allowed: Array) -> Branch | bool | None:
     """Find out whether a start is in a singular position; if so, return the Branch of the motion that leaves it.
 
-    `state`: [q, v, a] at the start; `rank`: rank of C_q there. Return None if the start counts as not singular: the
-    rank does not rise along the motion, or C depends on t, or non-holonomic constraints exist. Return False if the
-    branch is not certain: another one may have velocities closer to v than the tolerances `allowed` (n_q,), or no state
-    on the branch was found.
+    `state`: [q, v, a] at the start; `rank`: rank of C_q at the start. Return None if the start counts as not singular:
+    the rank does not rise along the motion, or C depends on t, or non-holonomic constraints exist. Return False if the
+    branch is not certain: velocities of another branch may be closer to v than the tolerances `allowed` (n_q,), or no
+    state on the branch was found.
     """
     if system.n_a > 0 or "constraint_rate" in system.given or not 0 < rank < min(system.n_c, system.n_q):
         return None

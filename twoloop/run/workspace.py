@@ -40,10 +40,10 @@ from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
 
-# forces that change if a coordinate or velocity x is displaced depend on x; the displacement is this * max(1, |x|)
+# to find out if forces depend on a coordinate or velocity x, it is displaced by this number times max(1, |x|)
 DISPLACEMENT = 1e-3
-# Newton's matrix in implicit steps gets sparse factors if at most this fraction of the force derivatives is nonzero,
-# and if they take at most this fraction of the operations of dense factors
+# Newton's matrix in implicit steps is factorized as a sparse matrix if at most this fraction of its force derivatives
+# is nonzero, and if this takes at most this fraction of the operations of dense factorization
 MAX_NEWTON_SHARE = 0.2
 
 
@@ -58,7 +58,7 @@ def newton_form(
 ) -> tuple[NDArray[np.int32], int] | None:
     """Return the program (list of operations) that factorizes Newton's sparse matrix, and the number of column groups.
 
-    Columns of a group have no nonzero entries in the same row, so that one finite difference of forces yields them all.
+    Columns of a group have no nonzero entries in the same row: so one finite difference of forces yields all of them.
     `mass`, `jacobian`: indices of nonzero entries of M and C_q. `bodies`: coordinates of each body. `stiff`: result of
     `_stiff_rows`. Return None if sparse factors would not be much faster than dense ones.
     """
@@ -87,7 +87,7 @@ def _derivative_entries(
 ) -> set[tuple[int, int]]:
     """Find the nonzero entries of d(Q - C_q^T lam)/dq and dQ/dv (Q: forces); return the set of their (i, j) and (j, i).
 
-    The search stops once it has found more than `max_entries`.
+    Stop the search once the set has more than `max_entries` elements.
     """
 
     def reaction(q: Array) -> Array:
@@ -111,14 +111,12 @@ def _derivative_entries(
     return entries
 
 
-# a direction of motion of a body (eigenvector of its block of M) is massless if its eigenvalue is at most this fraction
-# of the largest eigenvalue of the block
-MASSLESS_RATIO = 1e-10
+MASSLESS_RATIO = 1e-10  # an eigenvector of a body's block of M is massless if eigenvalue / largest one is at most this
 # a singular M becomes invertible if g^T g is added to it for some rows g of C_q. A row may be chosen if its component
 # along massless directions is longer than this fraction of its norm
 MIN_MASSLESS_FRACTION = 1e-3
-MIN_SIZE_NEWTON = 1.6  # Newton's matrix gets dense factors if n_q < this times LARGE, the size of a large system
-MAX_SHARE = 0.05  # sparse factors of M and C_q are used if they take at most this fraction of the dense operations
+MIN_SIZE_NEWTON = 1.6  # Newton's matrix gets dense factors if n_q < this * LARGE (smallest n_q of a large system)
+MAX_SHARE = 0.05  # M and C_q are factorized as sparse matrices if this takes at most this fraction of dense operations
 
 
 class FixedOrderForm(NamedTuple):
@@ -207,7 +205,7 @@ def _coordinates_of_bodies(system: ConstrainedSystem, mass: Entries) -> list[tup
     """Return a tuple of coordinates for each body that is known.
 
     The joints of the system name one body each, so that bodies at the ends of chains may be missing. If all bodies have
-    seven coordinates in a row (position and Euler parameters), none is missing.
+    seven coordinates (position and Euler parameters), no body is missing.
     """
     coordinates_by_joint = [joint.translation + joint.rotation for joint in system.joints]
     layouts = {tuple(j - body[0] for j in body) for body in coordinates_by_joint}
@@ -259,7 +257,7 @@ def _stiff_rows(
 
 
 def _massless_directions(block: Array) -> Array:
-    """Return as rows the massless directions of a body, given its block of M; all directions if it is not finite."""
+    """Return the massless directions of a body (rows) for its block of M; all directions if the block is not finite."""
     if not np.isfinite(block).all():
         return np.eye(len(block))
     values, directions = np.linalg.eigh(block)
@@ -290,7 +288,7 @@ def _mass_pattern(system: ConstrainedSystem, t0: float, q0: Array) -> Array:
     return pattern
 
 
-GAMMA_ACCURACY = 1e-11  # gamma by finite differences may always have this relative error: less cannot be achieved
+GAMMA_ACCURACY = 1e-11  # relative error of gamma that is always allowed: finite differences are not more accurate
 MAX_KITS = 16  # largest number of kits in a system's cache; the oldest kit is removed first
 
 

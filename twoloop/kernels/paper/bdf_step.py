@@ -207,7 +207,8 @@ def _difference_norm(tolerances, y, y1, d, sign, difference):
 def _choose_order(options, memory, tolerances, trial, y, y1, d):
     """Choose the next order (NEXT_ORDER); return the error estimate, in tolerances, and (next step size) / (this one).
 
-    y, y1: (q, v) at both ends of the step. d: y1 minus its prediction. `trial`: differences from `_predict_state`.
+    y, y1: (q, v) at both ends of the step. d: y1 minus its prediction. `trial`: its row k contains the differences of
+    order k of (q, v) at past steps, scaled to this step size by `_predict_state`.
     """
     k, depth = int(memory[ORDER]), int(memory[DEPTH])
     spans, constants = _coefficient_row(memory, NEW_SPANS), _coefficient_row(memory, ERROR_CONSTANTS)

@@ -75,9 +75,9 @@ def _is_symmetric(A):
 
 @compiled
 def _fill_newton_matrix(w, memory, n, m, z, H):
-    """Store Newton's matrix T^T (M - z^2 K - z D) T in H (m^2 numbers, row by row); m: number of degrees of freedom.
+    """Store T^T (M - z^2 K - z D) T in H: Newton's matrix, reduced to the m degrees of freedom by the columns of T.
 
-    z: step size times gamma. M: mass matrix. K, D: derivatives of forces by q and v. Columns of T: allowed velocities.
+    These columns are the allowed velocities; z = gamma h; K and D are the derivatives of forces by q and v.
     """
     N, Kr, Dr = (
         matrix_storage(w, n, at.SYSTEMS),

@@ -16,16 +16,16 @@ from twoloop.kernels.data.indices import ATOL, DONE, ESTIMATE, LEAST, RTOL
 from twoloop.kernels.evaluation.inner_loop import evaluate, evaluate_state, evaluate_without_projection, project
 from twoloop.kernels.linalg.dense import copy, sum_rows
 
-# indices of the scalars in the array `options`: number of stages s; tolerance of the inner loop; 1 if stages are not
-# projected onto the constraints, else 0; limit of the last correction of a converged projection. After the scalars,
-# the array contains the Butcher tableau A (s, s), b (s), c (s) and the weights of the two error estimates (s each)
+# indices of the scalars in the array `options`. STAGES: number of stages s. INNER_TOL: tolerance of the inner loop.
+# FREE: 1 if stages are not projected, else 0. THETA: a projection has converged if its last correction is at most this.
+# After the scalars: Butcher tableau A (s, s), b (s), c (s), and the weights of the two error estimates (s each)
 STAGES, INNER_TOL, FREE, THETA, N_SCALARS = range(5)
-# indices of vectors in the array `memory`: state [q, v] of a stage; fine and coarse estimate of the errors of [q, v].
-# Then follow the derivatives [v, a] of the s stages. Each vector has 2 n_q numbers, and is padded (see BLOCK_SIZE)
+# indices of vectors in the array `memory`. STAGE_STATE: state [q, v] of a stage. FINE_ERROR, COARSE_ERROR: estimates
+# of the error of [q, v]. The derivatives [v, a] of the s stages follow. Vectors have 2 n_q numbers and padding
 STAGE_STATE, FINE_ERROR, COARSE_ERROR, N_VECTORS = range(4)
 BLOCK_SIZE = 8  # vectors are padded to a multiple of this size, so that loops over them have no remainder
-# once a run has come near a singular position, error estimates are multiplied by STRICT, because phase errors grow at
-# each such position. For tolerances below STRICT * LEAST_STRICT the factor is smaller; it is 1 below LEAST_STRICT
+# once a run has come near a singular position, where phase errors grow, the error estimates are multiplied by
+# (smallest tolerance) / LEAST_STRICT, but by at least 1 and at most STRICT
 STRICT, LEAST_STRICT = 10.0, 1e-11
 
 
@@ -82,7 +82,7 @@ def _vector_view(memory, n, index):
 
 @compiled
 def _add_weighted_slopes(y, h, weights, slopes, total, y1):
-    """Set y1 to y + h * (sum of weights[k] * slopes[k]); the sum is computed first, in `total`, to reduce rounding."""
+    """Set y1 to y + h * (sum of weights[k] * slopes[k]); first, the sum is stored in `total`, to reduce rounding."""
     sum_rows(weights, slopes, total)
     for m in range(y.size):
         y1[m] = y[m] + h * total[m]
@@ -90,13 +90,12 @@ def _add_weighted_slopes(y, h, weights, slopes, total, y1):
 
 @compiled
 def largest_error(tolerances, y, y1, fine_error, coarse_error, strict):
-    """Return the estimated error e^2 / sqrt(e^2 + d^2) of a step from y to y1 (2 n each), in units of the tolerances.
+    """Return the estimated error of a step from state y = (q, v) to y1 (2 n each), in units of the tolerances.
 
-    e and d are the largest components of the error estimates `fine_error` and `coarse_error` (2 n, for positions and
-    velocities), relative to atol + rtol |y|. The formula is not applied to each component separately: if the coarse
-    estimate of a component passes through zero, its result would be e, which is of low order, and steps would need up
-    to 30 % more evaluations. If `strict`, return e^(3/2) / (e^2 + d^2)^(1/4) instead: near a singular position, terms
-    of high order are not small.
+    Let e and d be the largest components of `fine_error` and `coarse_error` (2 n each), relative to atol + rtol |y|.
+    The result is e^2 / sqrt(e^2 + d^2); if `strict` (near a singular position, where terms of high order are not
+    small), e^(3/2) / (e^2 + d^2)^(1/4). Single components have no such result: where a coarse estimate passes through
+    zero, the result would be e, which is of low order, and steps would need up to 30 % more evaluations.
     """
     n = fine_error.size // 2
     rtol = tolerances[RTOL]
@@ -116,7 +115,7 @@ def largest_error(tolerances, y, y1, fine_error, coarse_error, strict):
 
 @compiled
 def _estimate_error(tolerances, h, fine, coarse, y, y1, slopes, fine_error, coarse_error, strict):
-    """Compute both error estimates, h * weights @ slopes, of a step from y to y1; return their `largest_error`."""
+    """Store both error estimates of a step, h * fine @ slopes and h * coarse @ slopes; return their `largest_error`."""
     sum_rows(fine, slopes, fine_error)
     sum_rows(coarse, slopes, coarse_error)
     for m in range(y.size):
@@ -139,8 +138,7 @@ def explicit_step(f, w, options, memory, t, h, tolerances, state, new_state):
     )
     begin, width = N_VECTORS * _padded_width(n), _padded_width(n)
     slopes = memory[begin : begin + s * width].reshape((s, width))  # velocities and accelerations of each stage
-    # near a singular position, stages are projected even if FREE is 1: otherwise, they might be on the wrong side of
-    # the position, or their velocities inaccurate
+    # stages are always projected near a singular position: else they might be beyond it, or have inaccurate velocities
     is_near = options[FREE] == 1.0 and w.nearly_singular != 0.0
     is_free = options[FREE] == 1.0 and not is_near
     ratio_to_gap = gap_ratio(tolerances, h)
@@ -149,7 +147,7 @@ def explicit_step(f, w, options, memory, t, h, tolerances, state, new_state):
     w.n_outer += 1
     copy(state[n : 3 * n], slopes[0])
     for j in range(1, s):
-        _add_weighted_slopes(y, h, A[j, :j], slopes, stage, stage)  # first guesses of dependent coordinates
+        _add_weighted_slopes(y, h, A[j, :j], slopes, stage, stage)  # for dependent coordinates, only first guesses
         v_stage, a_stage = slopes[j, :n], slopes[j, n : 2 * n]
         copy(stage[n : 2 * n], v_stage)
         if is_free:

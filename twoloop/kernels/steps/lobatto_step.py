@@ -50,31 +50,32 @@ from twoloop.kernels.linalg.dense import copy
     THETA,  # a projection has converged if its last correction is at most this, see `project`
     N_ITERATED,  # number of coordinates on which accelerations depend; only these change in the fixed-point iteration
     N_ROWS,  # number of constraints
-    FREE,  # if a step is longer than FREE * tolerances[DEFECT_GAP], its defect is also evaluated between nodes
-    MAY_REPEAT,  # 1: each iteration may evaluate accelerations twice; 0: only once, if twice takes twice as long
+    FREE,  # the defect is also evaluated between nodes if step size > FREE * (longest time between evaluations)
+    MAY_REPEAT,  # 1: a sweep may evaluate accelerations twice; 0: only once, as the second evaluation costs as much
     N_OPTIONS,
 ) = range(6)
 
-START_CONTRACTION = 0.12  # aim of the guessed first step size: each sweep multiplies the errors of the stages by this
+START_CONTRACTION = 0.12  # the first step size is guessed so that a sweep multiplies errors of the stages by this
 MAX_GUESSES = 4  # largest number of guesses of the first step size
 FACTOR_AFTER_DIVERGENCE = 0.6  # ratio of the next step size to the size of a step whose iteration did not converge
 SAFETY = 0.75  # safety factor on the step size for which the estimated error would equal the tolerance
-MAX_LIMITED = 24.0  # another method takes over if data[LIMITED] (steps limited by convergence) reaches this number
-MIN_CURVATURE = 0.1  # accelerations hardly vary in a step if data[CURVATURE], their Legendre coefficient, is smaller
+# another method takes over if a counter reaches this: +1 for a step limited by convergence, -1 for others, minimum 0
+MAX_LIMITED = 24.0
+# accelerations hardly vary in a step if their Legendre coefficients of degrees 5 and 6 are below this, in tolerances
+MIN_CURVATURE = 0.1
 N_PIVOT_PARTS = 4  # pivots of C_q are checked at 1/4, 1/2 and 3/4 of a step, the ends of this number of equal parts
-MIN_PIVOT_RATIO = 0.4  # another method takes over if a step reduces the smallest pivot of C_q below this fraction
+MIN_PIVOT_RATIO = 0.4  # another method takes over if a step multiplies the smallest pivot of C_q by less than this
 # if the smallest tolerance is below this, another method takes over once a singular position was near. Without this
 # rule, five more runs of the benchmark A02 (N-four-bar mechanism) end with wrong results
 TIGHT_TOLERANCE = 1e-8
-MAX_FAILURES = 12.0  # another method takes over if data[FAILURES] reaches this: +2 if a step diverges, -1 if accepted
-CHECKED_GAP = 0.0908  # longest time between evaluations, relative to the step size, if some are also between the nodes
+MAX_FAILURES = 12.0  # another method takes over if a counter reaches this: +2 if a step diverges, -1 if it is accepted
+CHECKED_GAP = 0.0908  # (longest time between evaluations) / (step size), if the defect is evaluated between nodes, too
 # largest ratio of successive step sizes: GROWTH_EARLY in the first N_EARLY steps of a run, GROWTH in later steps
 N_EARLY, GROWTH_EARLY, GROWTH = 6, 4.0, 1.3
 GROWTH_ONE_SWEEP = 30.0  # largest ratio of step sizes early in a run, after a step that took only one sweep
 MIN_FACTOR = 0.4  # smallest ratio of the next step size to the size of an accepted step
-LEAST_TREND = 0.4  # lower bound of the ratio of the step sizes that the errors of two successive steps allow
-# convergence allows steps this many times as long if each sweep evaluates accelerations twice instead of once
-GAIN_BY_REPEATS = 1.5
+LEAST_TREND = 0.4  # lower limit of (size that the error of a step allows) / (size that the last step's error allowed)
+GAIN_BY_REPEATS = 1.5  # convergence allows steps this many times as long if sweeps evaluate accelerations twice
 # sweeps stop evaluating accelerations twice (REPEATS = 0) if the convergence allows steps this many times as long as
 # the error estimate allows: the second evaluation then saves no time
 MAX_REACH = 2.5
@@ -95,7 +96,7 @@ def _aligned_view(memory):
 
 @merged
 def _reuse_rejected_polynomial(f, data, state):
-    """After a rejected step, let its polynomial of accelerations predict the stages of the next, shorter attempt."""
+    """After a rejected step, use the polynomial of its accelerations to predict the stages of the next attempt."""
     f.retry_nodes(data, state)
     if data[field.OLD_DEGREE] == 0.0:
         data[field.OLD_DEGREE] = max(data[field.DEGREE], 3.0)
@@ -107,8 +108,8 @@ def _solve_collocation(f, w, options, data, tolerances, t, h, state):
     """Solve for the stages of a step of size h; return a code, an error estimate, and a factor: next step size / h.
 
     The stages are stored in `data`, the memory of the method. The estimate is relative to the tolerances. Codes:
-    CONVERGED; REJECTED (estimate or defect too large, or no convergence); GUESSED (h, a guess of the first step size,
-    is poor: try h * factor instead); NOT_COMPUTED (accelerations could not be computed).
+    CONVERGED; REJECTED if the estimate or the defect is too large, or the iteration diverges; GUESSED if h, a guess of
+    the first step size, is poor (the caller tries h * factor); NOT_COMPUTED if accelerations cannot be computed.
     """
     is_first, is_estimated = data[field.PREDICTS] == 0.0, tolerances[ESTIMATE] == 1.0
     h_max = tolerances[DEFECT_GAP] / CHECKED_GAP
@@ -155,8 +156,8 @@ def _solve_collocation(f, w, options, data, tolerances, t, h, state):
     # the motion may be stiff if accelerations hardly vary, but the step needed as many sweeps as intended, or one less
     is_limited = data[field.CURVATURE] < MIN_CURVATURE and extra_sweeps >= -1.0
     data[field.LIMITED] = max(0.0, data[field.LIMITED] + (1.0 if is_limited else -1.0))
-    # `trend`: step size that the error of this step allows / size that the error of the last step allowed. If it is
-    # below 1, the sizes fall from step to step, and the next step should be shorter by this factor
+    # `trend`: (step size that the error of this step allows) / (size that the error of the last step allowed). A trend
+    # below 1 probably continues: so the next step size is multiplied by it
     h_allowed = h * min(data[field.FACTOR_OF_ERROR], MAX_EXTRAPOLATION)
     if error > 1e-6 and data[field.CURVATURE] >= MIN_CURVATURE:
         trend = 1.0 if is_first else min(max(h_allowed / data[field.ALLOWED_H], LEAST_TREND), 1.0)
@@ -177,7 +178,7 @@ def _solve_collocation(f, w, options, data, tolerances, t, h, state):
 
 @merged
 def _accept_polynomial(data):
-    """After an accepted step, let its polynomial of the accelerations predict the stages of the next step."""
+    """After an accepted step, use the polynomial of its accelerations to predict the stages of the next step."""
     if data[field.OLD_DEGREE] > 0.0:
         data[field.NEXT_DEGREE], data[field.OLD_DEGREE] = data[field.OLD_DEGREE], 0.0
     data[field.CURRENT] = 1.0 - data[field.CURRENT]
@@ -188,7 +189,7 @@ def _accept_polynomial(data):
 
 @merged
 def _must_change_method(w, data, tolerances):
-    """Return True if another method must take over, as stiffness limits the steps, or a singular position is near."""
+    """Return True if another method must take over: if stiffness limits the steps, or a singular position is near."""
     is_stiff = data[field.LIMITED] >= MAX_LIMITED or data[field.FAILURES] >= MAX_FAILURES
     is_near = w.near_now == 1.0 or tolerances[LEAST] < TIGHT_TOLERANCE
     return is_stiff or (w.nearly_singular == 1.0 and is_near)
@@ -196,9 +197,9 @@ def _must_change_method(w, data, tolerances):
 
 @compiled
 def _passes_singular_position(f, w, t, h, state, new_state):
-    """Return True if the smallest pivot of C_q within a step is below MIN_PIVOT_RATIO times the pivot at its beginning.
+    """Return True if the smallest pivot of C_q falls below MIN_PIVOT_RATIO times its value at the beginning of a step.
 
-    Another method then has to cross the singular position, near which stages that violate the constraints have wrong
+    Another method then has to cross the singular position: near it, stages that violate the constraints have wrong
     accelerations. Positions within the step are interpolated by the cubic through the states at both ends.
     """
     n, pivot = w.Q.size, w.pivot
@@ -281,11 +282,11 @@ def _project_ends(f, w, options, data, n, n_ends, out_t, out_state):
 
 @merged
 def _adopt_projection(f, w, options, data, tolerances, driven, n, k, t, row, state):
-    """Copy the projected state in lane k of `data` to `row` and `state`; if it is invalid, return False instead.
+    """Copy the projected state in lane k of `data` to `row` and `state`; but if it is invalid, return False.
 
-    The state is invalid if its projection has failed or has moved positions, from those in `row`, by more than the
-    tolerances, or if it violates redundant rows. If constraints depend on time (`driven`), the same limit holds for
-    velocities: a larger change would show a discontinuity of the drive between the nodes, see discontinuities.py.
+    The state is invalid if the projection has failed or changed the positions in `row` by more than the tolerances, or
+    if redundant rows are violated. If constraints depend on time (`driven`), the tolerances also limit the change of
+    velocities: a larger one would show a discontinuity of the drive between the nodes, see discontinuities.py.
     """
     _, _, _, _, _, ends, end_a, lam, _ = _array_offsets(n, int(options[N_ITERATED]), int(options[N_ROWS]))
     if data[field.VALID + k] == 0.0:
@@ -312,7 +313,7 @@ def _adopt_projection(f, w, options, data, tolerances, driven, n, k, t, row, sta
 
 @merged
 def _can_take_next_step(w, data, tolerances, control, clock, h):
-    """Return True if the integrator need not act before a step of size h: it is not too short, and the method suits."""
+    """Return True if the integrator need not act before the next step: h is not too short, and the method suits."""
     h_long = clock[at.H_LONG]
     if h <= control[at.SHORTEST] or h < COLLAPSED_STEP * h_long or _must_change_method(w, data, tolerances):
         return False
@@ -346,7 +347,7 @@ def _take_steps(f, w, options, data, tolerances, control, clock, goal, state, n_
         out_t[n_ends], out_steps[n_ends, at.H] = t, h
         data[field.DEFECTS + n_ends] = data[field.DEFECT]
         copy(state[: 2 * n], out_state[n_ends, : 2 * n])
-        # a step shortened to reach `goal` does not limit the size of the next step
+        # if this step was shortened to end at `goal`, the next one may be as long as was wanted
         clock[at.H_NEXT] = max(h * factor, h_wanted) if h < h_wanted else h * factor
         n_ends += 1
     return n_ends
@@ -358,8 +359,8 @@ def lobatto_steps(
 ):
     """Take at most LANES steps in a row, and project their ends together; return the number of accepted steps.
 
-    This call also ends when the run's number of accepted steps is a multiple of LANES. So projections are grouped in
-    the same way, wherever the integrator pauses (for example to look for Ctrl-C), and results do not change.
+    The last step is the one that makes the run's number of accepted steps a multiple of LANES. So results do not depend
+    on where the integrator pauses, for example to look for Ctrl-C: the same steps are always projected together.
     """
     data, n = _aligned_view(memory), w.Q.size
     if out_t.size < LANES or w.nearly_singular == 1.0:

@@ -56,8 +56,8 @@ from twoloop.kernels.steps.velocity_errors import STEPS_TO_DECAY, filtered_veloc
 
 # the next step computes new derivatives if the last Newton correction exceeds this fraction of the previous one
 SLOW_CONTRACTION = 0.05
-# in steps of fixed size, rounding may prevent that corrections decrease to the tolerance. Newton's method has also
-# converged if the last correction, relative to the max(1, |value|), is at most this; otherwise, the step fails
+# in steps of fixed size, rounding may prevent that corrections decrease to the tolerance. So Newton's method has also
+# converged if the last correction is at most this number times max(1, |corrected value|)
 MAX_ROUNDING_CORRECTION_FIXED = 1e-9
 
 
@@ -141,9 +141,9 @@ def _solve_stages(f, w, options, memory, t, h, tolerances, q, v, A_stage):
 
 @compiled
 def _filter_errors(f, w, options, memory, h, e_q, e_v):
-    """Remove stiff components of error estimates: replace (e_q, e_v) by (I - z J)^-1 (e_q, e_v), z = h gamma0.
+    """Remove stiff components of error estimates: replace (e_q, e_v) by (I - z J)^-1 (e_q, e_v).
 
-    J is the Jacobian of (v_i, a_i) by (q_i, v_i). For gamma0, a constant of the method, see GAMMA0. The estimates are
+    J: derivative of (v_i, a_i) by (q_i, v_i). z: step size h times the constant GAMMA0 of the method. The estimates are
     the first n_dof entries of the vectors e_q and e_v (n_q each); the other entries are scratch.
     """
     s = int(options[STAGES])
@@ -199,11 +199,11 @@ def _estimate_error(f, w, options, memory, h, tolerances, state, new_state, A_st
 
 @compiled
 def _error_in_slow_directions(f, w, options, memory, h, tolerances, state, new_state):
-    """Return the effect, in tolerances, of the slowly decaying part of a velocity error, see `velocity_error`.
+    """Return the effect (see `velocity_error`) of the slowly decaying part of a velocity error, in tolerances.
 
-    The error is the vector E_V of `memory`. `filtered_velocity_error` assumes that all of it lasts only as long as its
-    fastest component. Here, a filter keeps the part that remains after STEPS_TO_DECAY steps; this part is assumed to
-    last for `motion_time`. If even all of E_V would have an effect of at most 1, return 0. E_Q, E_V are overwritten.
+    The velocity error is the vector E_V of `memory`. `filtered_velocity_error` assumes that all components last only as
+    long as the fastest one. Here, a filter keeps the part that remains after STEPS_TO_DECAY steps; this part is assumed
+    to last for `motion_time`. If even all of E_V has an effect of at most 1, return 0. E_Q, E_V are overwritten.
     """
     s, n = int(options[STAGES]), w.Q.size
     z = STEPS_TO_DECAY * h / options[newton_options_index(s) + at.GAMMA0]
@@ -216,7 +216,7 @@ def _error_in_slow_directions(f, w, options, memory, h, tolerances, state, new_s
         e_q[i] = 0.0
     if factor_filter(f, w, options, memory, s, z) == DONE:
         filter_error(f, w, options, memory, s, z, e_q, e_v)
-        # in unstable motion, the filter's matrix may be nearly singular, and enlarge the error instead of reducing it
+        # in unstable motion, the filter's matrix may be nearly singular: then the filter would enlarge the error
         error = min(error, velocity_error(w, tolerances, e_v, max_duration, state, new_state))
     if factor_filter(f, w, options, memory, s, h) != DONE:
         memory[at.H_FACTORED] = 0.0

@@ -74,8 +74,8 @@ from twoloop.kernels.steps.stages import (
 
 MAX_ITERATIONS = 15  # largest number of Newton iterations: if they do not converge, the step fails
 EQUAL_STEP_TOLERANCE = 1e-9  # step sizes count as equal up to this relative difference, which rounding of times causes
-# rounding may prevent that corrections decrease to the tolerance of Newton's method. The method has also converged if
-# the last correction is at most this fraction of the smallest tolerance of the run; otherwise, the step fails
+# rounding may prevent that corrections decrease to the tolerance of Newton's method. So the method has also converged
+# if the last correction is at most this fraction of the smallest tolerance of the run
 MAX_ROUNDING_CORRECTION = 0.1
 
 RELATIVE_DISPLACEMENT = 1e-7  # displacement of q or v in finite differences, relative to `typical_size`
@@ -88,13 +88,13 @@ DISPLACEMENT_INCREMENT, N_INCREMENTS = 0.37, 7
 
 @inlined
 def displace(value, size):
-    """Return `value` plus a displacement; `size`: see `typical_size`."""
+    """Return `value` plus a displacement for finite differences, proportional to max(size, |value|)."""
     return value + RELATIVE_DISPLACEMENT * max(size, abs(value))
 
 
 @inlined
 def displace_unequally(value, size, index):
-    """Return `value` plus a displacement that depends on the `index` of the coordinate, see DISPLACEMENT_INCREMENT."""
+    """Return `value` plus a displacement that depends on the coordinate's `index`, see DISPLACEMENT_INCREMENT."""
     return value + RELATIVE_DISPLACEMENT * max(size, abs(value)) * (
         1.0 + DISPLACEMENT_INCREMENT * (index % N_INCREMENTS)
     )
@@ -120,7 +120,7 @@ def _check_band_finite(A, b):
 
 @compiled
 def _has_jacobian_changed(f, w, t, q):
-    """Store C_q at (t, q) in w.Gx; return True if it differs from the C_q in w.G."""
+    """Store C_q at (t, q) in w.Gx; return True if w.Gx differs from the C_q in w.G."""
     w.Gx[:, :] = 0.0
     constraint_rows(f, w, t, q, w.Gx)
     for i in range(w.C.size):
@@ -134,8 +134,7 @@ def _has_jacobian_changed(f, w, t, q):
 def _subtract_reaction_tangent(f, w, tolerances, t, q, moved, b, K):
     """Subtract d(C_q^T lam)/dq, computed by differences, from the entries of K (n_q, n_q) with |i - j| <= b.
 
-    w.G must be C_q at (t, q). Coordinates j, j + 2 b + 1, ... are displaced together, as they affect different rows.
-    `moved` (n_q) is scratch.
+    w.G must be C_q at (t, q). Coordinates j, j + 2 b + 1, ... affect different rows: displace them together (`moved`).
     """
     n = q.size
     size = typical_size(tolerances, q)
@@ -217,11 +216,11 @@ def reduce_to_independents(w, matrix, matrix_T, reduced):
 
 @compiled
 def _fill_jacobians_from_tangents(f, w, tolerances, memory, s, t, q, v):
-    """Store J_q, J_v (derivatives of accelerations by q_i, v_i), computed from those of the forces; return a code."""
+    """Compute J_q, J_v (derivatives of accelerations by q_i, v_i) from those of forces, K and D; return a code."""
     n = q.size
     m = w.independent.size
     w.n_jacobians += 1
-    # the storage of old factors is free now. It receives K (later D), T^T M T, and products such as K T
+    # the storage of old factors is free now: use it for K (later D), T^T M T, and products such as K T
     K, R = as_matrix(matrix_storage(w, n, at.FILTER), n), as_matrix(matrix_storage(w, n, at.SYSTEMS), n)
     code = fill_tangent_by_q(f, w, tolerances, t, q, v, n - 1, vector(memory, s, n, at.Q_MOVED), K, R)
     if code != DONE:
@@ -247,7 +246,7 @@ def _fill_jacobians_from_tangents(f, w, tolerances, memory, s, t, q, v):
 
 @compiled
 def _fill_by_differences(f, w, options, tolerances, t, q, v, a, by_v, q_moved, v_moved, a_new, J):
-    """Store in J finite differences of accelerations by q_i (if `by_v`, by v_i); `a`: accelerations at (t, q, v)."""
+    """Store in J the derivative of accelerations by q_i (if `by_v`, by v_i), as differences from `a` at (t, q, v)."""
     base, moved = (v, v_moved) if by_v else (q, q_moved)
     size = typical_size(tolerances, base)
     for column in range(w.independent.size):
@@ -299,7 +298,10 @@ def _fill_dense_jacobians(f, w, options, tolerances, memory, s, t, q, v, a):
 
 @compiled
 def _factor_dense_matrix(w, memory, s, index, z, matrix):
-    """Factorize Newton's matrix I - z^2 J_q - z J_v in `matrix`; return DONE or SINGULAR; `index`: see `pivots_of`."""
+    """Compute and factorize Newton's matrix I - z^2 J_q - z J_v (J_q, J_v: derivatives of accelerations) in `matrix`.
+
+    Return DONE or SINGULAR. `index`: where pivots are stored, see `pivots_of`.
+    """
     n, m = w.Q.size, w.independent.size
     Jq, Jv = as_matrix(matrix_storage(w, n, at.DERIVATIVE_Q), m), as_matrix(matrix_storage(w, n, at.DERIVATIVE_V), m)
     damped = memory[at.HAS_DAMPING] == 1.0
@@ -332,16 +334,16 @@ def _filter_error_dense(w, options, memory, s, h, e_q, e_v):
 
 @inlined
 def _band_view(numbers, n, b):
-    """Return a view (n, 2 b + 1) of `numbers`: a matrix K with bandwidth b; its element [i, b + j - i] is K_ij."""
+    """Return a view (n, 2 b + 1) of the band of a matrix K in `numbers`; element [i, b + j - i] of the view is K_ij."""
     return numbers[: n * (2 * b + 1)].reshape((n, 2 * b + 1))
 
 
 @inlined
 def _border_views(w, n, r, b):
-    """Return views of three copies made when K was computed: independent rows of C_q (r, n); w.D; indices.
+    """Return views of copies made with K: independent rows of C_q (r, n); w.D; indices (r) of dependent coordinates.
 
-    w.D (n - r + 1, r) is the derivative of dependent by independent velocities, transposed; its last row are velocities
-    due to drives. The indices (r) are those of the dependent coordinates. The copies stand behind the band of K.
+    w.D (n - r + 1, r) is the derivative of dependent by independent velocities, transposed; its last row contains the
+    velocities due to drives. The copies are stored behind the band of K.
     """
     numbers = matrix_storage(w, n, at.DERIVATIVE_Q)
     start = n * (2 * b + 1)
@@ -480,7 +482,7 @@ def _factor_banded(w, memory, s, b, index, z, numbers, factorize, substitute):
 
 @compiled
 def _multiply_by_T(w, b, x, X):
-    """Complete independent velocities x[:n_dof] by the dependent ones that C_q requires: store T x in X (n_q)."""
+    """Store in X = T x (n_q) the independent velocities x[:n_dof], and the dependent velocities that they determine."""
     n_dof = w.independent.size
     _, D, columns = _border_views(w, w.Q.size, w.rows.size, b)
     for i in columns:
@@ -493,7 +495,7 @@ def _multiply_by_T(w, b, x, X):
 
 @compiled
 def _solve_and_keep_independents(w, b, numbers, pivots, substitute, x):
-    """Solve the bordered system with right-hand side x (n_q); move independent entries of the result to x[:n_dof]."""
+    """Solve the bordered system with right-hand side x (n_q); store the result's independent entries in x[:n_dof]."""
     Cq, _, _ = _border_views(w, x.size, w.rows.size, b)
     solve_bordered(w, b, Cq, numbers, pivots, substitute, x)
     for k in range(w.independent.size):  # in ascending order, no entry is overwritten before it is read
@@ -520,8 +522,8 @@ def _filter_error_banded(f, w, options, memory, s, h, e_q, e_v):
 
 # --- sparse storage, for all coordinates
 
-# the sparsity pattern of K and D (derivatives of the residual by q, v) is complete if their product with a displacement
-# predicts the change of the residual: the difference must be at most this fraction of the sum of |terms| of the product
+# the sparsity pattern of a derivative of the residual (K by q, D by v) lacks entries if derivative * displacement
+# differs from the change of the residual by more than this fraction of the sum of |terms| of the product
 MAX_DEVIATION = 0.2
 RESIDUAL_ROUNDING = 1e-13  # rounding error of a difference of residuals, relative to the largest term of a residual
 N_SPARSE_VECTORS = 3  # number of real scratch vectors, which _sparse_scratch returns first
@@ -540,7 +542,10 @@ def matrices_size(program: np.ndarray, n_mass: int, n_jacobian: int, n_systems: 
 
 @inlined
 def _sparse_derivative_views(f, w):
-    """Return views of w.matrices: entries of M, G, K, D; for each row of G, 1 if independent, and its `stiffness`."""
+    """Return six views of w.matrices: the entries of M, G, K and D, and two arrays with a number for each row g of G.
+
+    Numbers in the first array: 1 if g is independent, else 0. In the second one: s if s g^T g is added to a singular M.
+    """
     n_mass, n_jacobian, n_rows = w.mass_values.size, w.jacobian_values.size, w.is_independent.size
     begin_K = n_mass + n_jacobian
     begin_D = begin_K + mass_entries_of(f.newton_program)[0].size - n_mass
@@ -575,7 +580,7 @@ def _sparse_scratch(f, w):
 
 @inlined
 def _sparse_factor_view(f, w, k):
-    """Return a real view of factors: of the matrix of `filter_error` (k = 0), or Newton's for eigenvalue k - 1."""
+    """Return a real view of the factors of the matrix in `filter_error` (k = 0), or of linear system k - 1 (k > 0)."""
     n = f.newton_program[N_PIVOTS]
     n_factors = n + 2 * f.newton_program[N_OFF_DIAGONAL]
     begin = w.mass_values.size + w.jacobian_values.size + (N_SPARSE_VECTORS + 7) * n
@@ -609,7 +614,7 @@ def _fill_sparse_residual(f, w, t, q, v, renews_G, out):
 
 @compiled
 def _fill_tangent_entries_by_differences(f, w, tolerances, t, q, v, by_v, base, residual, moved, entries):
-    """Store in `entries` finite differences of the residual by q (if `by_v`, by v); return DONE or NOT_FINITE.
+    """Store the `entries` of K (if `by_v`, of D), finite differences of the residual; return DONE or NOT_FINITE.
 
     Columns of a group have no rows in common: one difference yields them all. `base`: residual at (t, q, v);
     `residual` and `moved` (n_q): scratch.
@@ -635,9 +640,9 @@ def _fill_tangent_entries_by_differences(f, w, tolerances, t, q, v, by_v, base, 
 
 @compiled
 def _has_complete_pattern(f, base, residual, base_point, moved, largest, entries, predicted):
-    """Return True if a sparse tangent (K or D) lacks no entries: it must predict the change of the residual.
+    """Return True if the sparse matrix K or D, given by its `entries`, predicts the change of the residual.
 
-    `entries`: entries of the tangent. `base`, `residual`: residuals at `base_point` (q or v) and at the displaced point
+    If not, its pattern lacks entries. `base`, `residual`: residuals at `base_point` (q or v) and at the displaced point
     `moved`. `largest`: largest term of a residual, for rounding. `residual` and `predicted` (n_q) are overwritten.
     """
     rows, columns, _ = tangent_entries_of(f.newton_program)
@@ -701,7 +706,10 @@ def _fill_sparse_tangents(f, w, tolerances, memory, t, q, v):
 
 @compiled
 def _factor_sparse_matrix(f, w, z, factors):
-    """Factorize Newton's sparse matrix [M - z^2 K - z D, G^T; G, 0], z real or complex; return DONE or SINGULAR."""
+    """Factorize Newton's sparse matrix [M - z^2 K - z D, G^T; G, 0] for a real or complex z; return DONE or SINGULAR.
+
+    z: step size times a coefficient of the method. K, D: derivatives of the forces with reactions by q and by v.
+    """
     mass, jacobian, K, D, is_independent, stiffness = _sparse_derivative_views(f, w)
     _, _, _, pivot_sizes, _, _ = _sparse_scratch(f, w)
     w.n_factorizations += 1
@@ -711,7 +719,7 @@ def _factor_sparse_matrix(f, w, z, factors):
 
 @compiled
 def _fill_sparse_right_side(f, w, r, right):
-    """Store the right-hand side [M r; G r] of the bordered system in `right`, adjusted for redundant rows."""
+    """Store [M r; G r] in `right`: right-hand side for residuals r of accelerations; add terms of redundant rows."""
     mass, jacobian, _, _, is_independent, stiffness = _sparse_derivative_views(f, w)
     right[:] = 0.0
     rows, columns, _ = mass_entries_of(f.newton_program)
@@ -745,7 +753,7 @@ def _filter_error_sparse(f, w, options, s, h, e_q, e_v):
 def fill_derivatives(f, w, options, tolerances, memory, s, t, q, v, a):
     """Store the derivatives for Newton's matrix at the last evaluated state (t, q, v); return DONE or an error code.
 
-    They are derivatives of accelerations in dense storage, else of forces. `a`: accelerations at this state.
+    In dense storage, these are derivatives of accelerations, else of forces. `a`: accelerations at this state.
     """
     if f.form == FIXED_ORDER:
         return _fill_sparse_tangents(f, w, tolerances, memory, t, q, v)
@@ -756,7 +764,7 @@ def fill_derivatives(f, w, options, tolerances, memory, s, t, q, v, a):
 
 @compiled
 def _factor_system(f, w, memory, s, index, z, numbers, factorize, substitute):
-    """Factorize Newton's matrix for z, real or complex, in `numbers`; for arguments and code see `_factor_banded`."""
+    """Compute and factorize Newton's matrix for z (real or complex) in `numbers`; arguments: see `_factor_banded`."""
     w.n_factorizations += 1
     if f.bandwidth >= 0:
         return _factor_banded(w, memory, s, f.bandwidth, index, z, numbers, factorize, substitute)
@@ -774,7 +782,7 @@ def factor_filter(f, w, options, memory, s, h):
 
 @compiled
 def factor_systems(f, w, options, memory, s, h):
-    """Factorize all matrices of a step of size h: that of `filter_error`, and Newton's for each eigenvalue of A."""
+    """Factorize the matrices of a step of size h: of `filter_error`, and of each system of Newton's method."""
     offset = newton_options_index(s)
     n_systems, n_real = count_systems(options, s), int(options[offset + at.N_REAL])
     code = factor_filter(f, w, options, memory, s, h)
@@ -794,7 +802,7 @@ def factor_systems(f, w, options, memory, s, h):
 
 @compiled
 def _solve_system(f, w, memory, s, index, numbers, substitute, X, x):
-    """Replace x[:n_dof], a right-hand side, by the solution of Newton's system with the factors `numbers`."""
+    """Replace the right-hand side x[:n_dof] by the solution of Newton's system; `numbers`: factors of its matrix."""
     m, pivots = w.independent.size, pivots_of(memory, s, w.Q.size, index)
     if f.bandwidth >= 0:
         _multiply_by_T(w, f.bandwidth, x, X)
@@ -815,7 +823,7 @@ def _solve_sparse_system(f, w, numbers, right, y, x):
 
 @compiled
 def solve_system(f, w, options, memory, s, k, x):
-    """Replace x[:n_dof], a complex right-hand side, by the solution of Newton's system for eigenvalue k of the tableau.
+    """Replace the complex right-hand side x[:n_dof] by the solution of Newton's system for eigenvalue k of the tableau.
 
     If this eigenvalue is real, only the real part of x is used, and the solution is real.
     """
@@ -844,8 +852,8 @@ def solve_system(f, w, options, memory, s, k, x):
 def filter_error(f, w, options, memory, s, h, e_q, e_v):
     """Remove stiff components from e_v: replace it by (I - z^2 J_q - z J_v)^-1 (e_v + z J_q e_q), with z = h gamma0.
 
-    J_q, J_v: derivatives of accelerations by q_i and v_i; gamma0: a number of the tableau, see GAMMA0. The
-    estimated errors of q and v are the first n_dof entries of e_q and e_v (n_q); the other entries are scratch.
+    J_q, J_v: derivatives of accelerations by q_i and v_i. gamma0: a constant of the method, see GAMMA0. The estimated
+    errors of q and v are the first n_dof entries of e_q and e_v (n_q each); the other entries are scratch.
     """
     m = w.independent.size
     if f.form == FIXED_ORDER:
@@ -869,7 +877,7 @@ def correct_stages(f, w, options, memory, s, residual, A_stage):
     n_systems = count_systems(options, s)
     x = complex_vector(memory, s, n, n_systems, 0)
     offset += at.N_EIGEN_SCALARS + s
-    corrections = block(memory, s, n, at.Q_STAGE)  # scratch: stage positions are computed anew before their use
+    corrections = block(memory, s, n, at.Q_STAGE)  # scratch here: later, stage positions are computed anew
     corrections[:, :] = 0.0
     for k in range(n_systems):
         begin_row = offset + 2

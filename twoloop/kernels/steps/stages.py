@@ -13,9 +13,9 @@ from twoloop.kernels.control.step_size import commit_nothing
 from twoloop.kernels.data.common import ATTEMPT, Attempt, Step, allowed_error, compiled, inlined, kernel, merged
 from twoloop.kernels.data.indices import NOT_LOADED
 
-MAX_STEP_RATIO = 3.0  # stages are extrapolated from the last step, unless the new step is more than this times as long
-# comparing a step with two half steps (Richardson) misses a force that jumps near an end of the step. So the error
-# estimate of a step is the larger of Richardson's and END_ERROR_WEIGHT * (result of `estimate_end_error`)
+MAX_STEP_RATIO = 3.0  # stages are extrapolated from the last step if (new step size) / (last step size) is at most this
+# Richardson's estimate, which compares a step with two half steps, misses a force that jumps near an end of the step.
+# So the error of a step is estimated as the maximum of this and END_ERROR_WEIGHT * (result of `estimate_end_error`)
 END_ERROR_WEIGHT = 0.01
 
 # indices of the scalars in `options` of a method with s stages and the Butcher tableau A, b, c. After the scalars,
@@ -25,7 +25,7 @@ END_ERROR_WEIGHT = 0.01
     STAGES,  # number of stages s
     INNER_TOL,  # tolerance of the inner loop
     OUTER_TOL,  # tolerance of the outer loop
-    EXTRAPOLATION,  # factor 1 / (2^order - 1) of Richardson's extrapolation; 0: the new state is not extrapolated
+    EXTRAPOLATION,  # factor 1 / (2^order - 1) in Richardson's extrapolation of the new state; 0: no extrapolation
     OUTER_TEST,  # 1: the outer loop ends when all coordinates have converged; 0: when the independent ones have
     POWER,  # order of the method minus 1, an exponent in `estimate_end_error`
     N_SCALARS,
@@ -42,7 +42,7 @@ def options_array(
     outer_test: float = 1.0,
     power: float = 0.0,
 ) -> NDArray[np.float64]:
-    """Return the array `options` of a method with the Butcher tableau A, b, c; for other arguments see STAGES."""
+    """Return the array `options` of a method; A, b, c: Butcher tableau; other arguments: see STAGES and below it."""
     A, b, c = np.asarray(A), np.asarray(b), np.asarray(c)
     scalars = np.array([float(len(b)), inner_tol, outer_tol, extrapolation, outer_test, power])
     vectors = (b, b @ A, c, lagrange_values(c, 0.0), lagrange_values(c, 1.0))
@@ -103,10 +103,10 @@ def estimate_end_error(tolerances, options, h, state, new_state, A_stage):
 
     The estimate detects forces that jump within a step, even between an end and the nearest stage. Let w be the range
     of the stage accelerations, and e the error of their interpolation polynomial at the ends of the step, where the
-    accelerations are known. In smooth motion, terms of the polynomial decrease by a constant factor f. Then
-    e = w f^(s - 1), and the error of the method is about h w f^(order - 1): this is the estimate, with f from e and w.
-    After a jump, e is as large as w, and the estimate h w: steps shrink until the jump no longer matters. Methods need
-    a second estimate, too: e may be zero by chance, with errors up to 100 tolerances.
+    accelerations are known. In smooth motion, successive terms of the polynomial have a constant ratio f: so
+    e = w f^(s - 1) yields f, and the error of the method is about h w f^(order - 1), which is the estimate. If a force
+    jumps, e is as large as w, and the estimate becomes h w: steps shrink until the jump no longer matters. Methods also
+    need a second estimate: e may be zero by chance although errors are up to 100 tolerances.
     """
     s, n = A_stage.shape
     offset = N_SCALARS + 2 * s * s + 3 * s
@@ -151,8 +151,8 @@ def estimate_end_error(tolerances, options, h, state, new_state, A_stage):
     HAS_PREVIOUS,  # 1: the block PREVIOUS contains the stage accelerations of the last accepted step
     H_PREVIOUS,  # size of the last accepted step (s)
     HAS_JACOBIAN,  # 1: Newton's method may use the stored derivatives of accelerations or forces; 0: compute new ones
-    IS_FRESH,  # 1: the stored derivatives were computed for the stages of this step; 0: earlier, or for its end
-    PARTITION_NUMBER,  # w.generation (number of partitions so far) when the stored derivatives were computed
+    IS_FRESH,  # 1: the stored derivatives were computed for the stages of this step; 0: for another step, or for an end
+    PARTITION_NUMBER,  # number of partitions of coordinates (w.generation) when the stored derivatives were computed
     H_FACTORED,  # step size (s) for which the linear systems of Newton's method are factored; 0: no factors are stored
     CONTRACTION,  # ratio of the last correction of Newton's method to the one before
     HAS_DAMPING,  # 1: forces depend on velocities; 0: they do not, so that derivatives by velocities are zero
@@ -221,7 +221,7 @@ def memory_size(n_systems: int, s: int, n_q: int) -> int:
 
 
 def n_matrices(n_systems: int) -> int:
-    """Return how many matrices (n_q, n_q) w.matrices must hold for `n_systems` linear systems, see SYSTEMS."""
+    """Return the number of matrices (n_q, n_q) in w.matrices for `n_systems` linear systems, see SYSTEMS."""
     return SYSTEMS + 2 * n_systems
 
 
@@ -313,7 +313,7 @@ def system_storage(w, n, k):
 
 @inlined
 def _storage_after_vectors(memory, s, n, k):
-    """Return a view of 2 n numbers of `memory`; it begins k * n numbers behind the end of the vectors (see A_NEW)."""
+    """Return a view of 2 n numbers of `memory`, which begin k * n numbers behind the last vector (see A_NEW)."""
     start = N_MEMORY_SCALARS + (N_BLOCKS * s + N_VECTORS + k) * n
     return memory[start : start + 2 * n]
 
@@ -326,13 +326,13 @@ def pivots_of(memory, s, n, k):
 
 @inlined
 def complex_vector(memory, s, n, n_systems, index):
-    """Return a view (n) of complex scratch vector `index` (0 or 1) of `memory`."""
+    """Return a view (n) of complex scratch vector `index` (0 or 1) in `memory`, for `n_systems` linear systems."""
     return _storage_after_vectors(memory, s, n, 1 + n_systems + 2 * index).view(np.complex128)
 
 
 @kernel(ATTEMPT)
 def request_loading(f, w, options, memory, t, h, tolerances, state, new_state):
-    """Take no step, but return the code NOT_LOADED: the caller loads the machine code of the method, then repeats."""
+    """Return NOT_LOADED without a step: then the caller loads the machine code of the method, and tries again."""
     return Attempt(NOT_LOADED, np.inf, 0.0)
 
 
@@ -340,7 +340,7 @@ PLACEHOLDER_STEP = Step(request_loading, commit_nothing)
 
 
 class LazyStep(NamedTuple):
-    """Reference to a Step that is imported when needed: its name, and its module, such as "steps.newton_step"."""
+    """Reference to a Step that is imported when needed: name of the Step and of its module ("steps.newton_step")."""
 
     module: str
     name: str
@@ -350,12 +350,12 @@ LOADED_STEPS: dict[LazyStep, Step] = {}  # steps whose modules have been importe
 
 
 def load_step(step: Any) -> Any:
-    """Return `step` if it is a Step; if it is a LazyStep, import its module, and return the Step there."""
+    """Return the Step to which `step` refers (importing its module if `step` is a LazyStep); return a Step itself."""
     if isinstance(step, LazyStep) and step not in LOADED_STEPS:
         LOADED_STEPS[step] = getattr(import_module(f"twoloop.kernels.{step.module}"), step.name)
     return step_if_loaded(step)
 
 
 def step_if_loaded(step: Any) -> Any:
-    """Return `step` if it is a Step; for a LazyStep, its Step if that is imported already, else PLACEHOLDER_STEP."""
+    """Return the Step to which `step` refers, or PLACEHOLDER_STEP if this Step is not imported yet."""
     return LOADED_STEPS.get(step, PLACEHOLDER_STEP) if isinstance(step, LazyStep) else step

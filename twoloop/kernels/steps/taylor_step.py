@@ -47,7 +47,7 @@ from twoloop.kernels.linalg.saddle_point import solve_with_multipliers
     N_NODES,  # number of quantities of the series program: inputs, unknowns and results of operations
     EARLY_WIDTH,  # number of operations on t and q only (early operations), rounded up to a multiple of eight
     LATE_WIDTH,  # number of operations on velocities, too (late operations), rounded up to a multiple of eight
-    KEEP,  # 1: the steps are parts of one step, and all use the series about its beginning; 0: each has its own
+    KEEP,  # 1: all steps are parts of one long step, and use the series about its beginning; 0: each step has its own
     N_SCALARS,
 ) = range(7)
 # the 13 arrays that describe a list of operations (OperationGroups in twoloop.generate.series): array 0: groups of
@@ -71,19 +71,19 @@ KIND, BEGIN, END, MORE_FIRST, _, MORE_SECOND, _, N_GROUP = range(8)
 # One series is about the beginning of the step, the other one about the end of the attempted step
 (
     HAS_SERIES,  # 1: the series about the beginning of the step has been computed; 0: not yet
-    CURRENT,  # index (0 or 1) of that one of the two stored series which is about the beginning of the step
+    CURRENT,  # index (0 or 1) of the stored series about the beginning of the step
     UNIT,  # unit of time (s) of the series about the beginning of the step
     NEXT_UNIT,  # unit of time (s) of the series about the end of the last attempt
-    ALLOWED_SIZE,  # largest step size that the series about its beginning allows, in units of UNIT
-    NEXT_ALLOWED_SIZE,  # step size that the series about the end of the last attempt allows, in units of NEXT_UNIT
+    ALLOWED_SIZE,  # largest size of the step that the series about the beginning of the step allows, in units of UNIT
+    NEXT_ALLOWED_SIZE,  # largest step size that the series about the end of the last attempt allows, in NEXT_UNIT
     TRIED,  # 1: the last attempt has computed the series about its end, for the next step if the attempt is accepted
     PASSED,  # time (s) from the state about which the series is computed to the beginning of the step; 0 if KEEP = 0
     TARGET,  # index (0 or 1) of the stored series that `compute_coefficients` overwrites
-    # factor (at most 1) by which step sizes are reduced so that steps end near the constraints; 0: unknown
+    # step sizes are multiplied by this factor (at most 1), so that steps end near the constraints; 0: unknown
     DISTANCE_FACTOR,
     ATTEMPTS,  # number of attempts; it determines at which times within a step the defect is evaluated
-    SUSPECTED,  # 1: memory[SUSPECT] is a time that the run has not passed yet; 0: there is no such time
-    SUSPECT,  # time (s) at which the defect of a rejected step was too large: check the defect there again
+    SUSPECTED,  # 1: memory[SUSPECT] contains a time that the run has not passed yet; 0: SUSPECT has no meaning
+    SUSPECT,  # time (s) at which the defect of a rejected step was too large; the next attempts check it there again
     N_MEMORY_SCALARS,
 ) = range(14)
 
@@ -302,7 +302,8 @@ def array_views(options, memory, n, n_rows):
 def start_series(options, t, unit, state, N, series, begin_early, x, y, r, c):
     """Begin the Taylor series of a motion at t and `state`: store the coefficients that need no accelerations in N.
 
-    These are orders 0, 1 of t and q, and order 0 of v and of the operations EARLY. Also set r and c to zero.
+    These are orders 0 and 1 of t and q, order 0 of v, and order 0 of the operations EARLY (series x and y, results in
+    N from column `begin_early`). `unit`: unit of time (s). Also set the right-hand sides r and c to zero.
     """
     n = r.size
     r[:], c[:] = 0.0, 0.0
@@ -381,9 +382,7 @@ def compute_coefficients(f, w, options, memory, t, state, unit):
     return finish_series(w, order, series)
 
 
-# step sizes are chosen so that the distance of a step's end from the constraints, before projection, is about this
-# fraction of the allowed distance
-TARGET_PREDICTION_ERROR = 0.3
+TARGET_PREDICTION_ERROR = 0.3  # aim: (distance of a step's end from the constraints before projection) / allowed one
 # the series is exact near the beginning of a step, at NEAR_BEGIN: its defect there shows the rounding error. A later
 # defect counts as rounding error, too, if it is at most NOISE_RATIO times as large, and MAX_NOISE * allowed defect
 MAX_NOISE, NOISE_RATIO = 1e4, 10.0
@@ -395,7 +394,7 @@ MAX_DEFECT = 1e300  # replaces an infinite defect: a callback had no finite valu
 MIN_FACTOR = 0.1  # smallest ratio of the next step size to the size of a step rejected because of its defect
 MAX_GROWTH = 5.0  # largest ratio of successive step sizes, because coefficients are scaled by the previous step size
 MAX_FIRST_FACTOR = 1e6  # largest ratio of the first step size to its guess, so that powers of the ratio do not overflow
-TOO_SHORT = 2.0  # error above 1 by which a first step, much shorter than its series allows, is rejected and repeated
+TOO_SHORT = 2.0  # returned as error (> 1: rejected) of a first step much shorter than its series allows: repeat it
 
 
 @merged
@@ -413,7 +412,7 @@ def _compute_series(f, w, options, memory, t, state, unit, index):
 
 @merged
 def _max_step(tolerances, series, unit, order, n):
-    """Return the largest step size, in units of `unit` (s), at which the last two terms are within the tolerances."""
+    """Return the largest step size, in units of `unit` (s), with the last two terms of `series` within tolerances."""
     rtol, last, before = tolerances[RTOL], 0.0, 0.0
     row, row_before = order * n, (order - 1) * n
     for j in range(n):
@@ -488,11 +487,10 @@ def _is_rounding_defect(f, w, memory, t, h, tolerances, series, order, q, v, a, 
 
 @compiled
 def _first_large_defect(f, w, memory, t, h, tolerances, series, order, q, v, a):
-    """Check the defect within a step; return the first defect / allowed defect above 1, or 0 if there is none.
+    """Check the defect within a step; return the first (defect / allowed defect) above 1, or 0 if there is none.
 
-    It is evaluated at memory[SUSPECT], and at times that differ from attempt to attempt; rounding errors do not count.
-    The time of a returned defect is stored in memory[SUSPECT], unless an earlier time is there. w.defect becomes the
-    largest of the other defects.
+    The defect is evaluated at memory[SUSPECT], and at times that differ from attempt to attempt. Rounding errors do not
+    count. memory[SUSPECT] becomes the earliest time of a large defect, and w.defect the largest of the small defects.
     """
     max_gap, shift = tolerances[DEFECT_GAP], memory[ATTEMPTS] * GOLDEN_SECTION % 1.0
     n_points = 0
@@ -520,7 +518,7 @@ def _factor_after_large_defect(defect, order):
 
 @kernel(COMMIT)
 def commit_taylor(f, w, options, memory, tolerances, accepted):
-    """After an accepted step, make the series about its end the one for the next step; else keep the present one."""
+    """After an accepted step, use the series about its end for the next step; after a rejected one, keep the series."""
     if accepted and memory[TRIED] == 1.0:
         memory[CURRENT] = 1.0 - memory[CURRENT]
         memory[UNIT], memory[ALLOWED_SIZE] = memory[NEXT_UNIT], memory[NEXT_ALLOWED_SIZE]
@@ -580,8 +578,7 @@ def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
     distance = prediction_error(w, tolerances, h, q, v, q1)
     memory[DISTANCE_FACTOR], allowed_factor = 1.0, np.inf
     if distance > 0.0:
-        # the step may be much shorter than the series allows, because of MAX_GROWTH or a force ahead. Its relative size
-        # x / ALLOWED_SIZE then counts as 1 / MAX_GROWTH
+        # in a step much shorter than the series allows, x / ALLOWED_SIZE counts as 1 / MAX_GROWTH
         allowed_factor = (TARGET_PREDICTION_ERROR / distance) ** (1.0 / order)
         memory[DISTANCE_FACTOR] = min(1.0, max(x / memory[ALLOWED_SIZE], 1.0 / MAX_GROWTH) * allowed_factor)
     if distance > 1.0:

@@ -21,13 +21,13 @@ from twoloop.kernels.steps import stages as at
 from twoloop.kernels.steps.newton_systems import RELATIVE_DISPLACEMENT
 from twoloop.kernels.steps.stages import INNER_TOL, block, vector
 
-# if a velocity error changes as slowly as the motion, it is not due to a vibration. It keeps its sign in later steps,
-# so that position errors add up. To allow for this, its duration is multiplied by up to this factor
+# a velocity error that changes as slowly as the motion is not due to a vibration. Such an error keeps its sign in later
+# steps, so that position errors add up. To allow for this, the error's duration is multiplied by up to this factor
 SLOW_FACTOR = 10.0
 LONGEST_GAPS = 10.0  # velocity errors last at most this many times the longest allowed time between evaluations
 STEPS_TO_DECAY = 10.0  # number of steps after which fast components of a velocity error count as decayed
-FAST_DURATION = 20.0  # a duration of a velocity error is short if below this * step size * coefficient of the method
-OUTDATED_CHANGE = 0.3  # the Jacobian J counts as outdated if its relative change exceeds this
+FAST_DURATION = 20.0  # the duration of a velocity error is short if below this * z (step size * method's coefficient)
+OUTDATED_CHANGE = 0.3  # the Jacobian J of the equations of motion is outdated if its relative change exceeds this
 
 
 @compiled
