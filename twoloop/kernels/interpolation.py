@@ -95,7 +95,7 @@ def _evaluate_polynomials(states, i, kind, h, s, z, c, size, z_v, c_v, size_v, q
 
 @merged
 def _kind_by_duration(kind, tolerances, h, states, i):
-    """Return `kind`, or SEPARATE if the duration h is so short that rounding of q would spoil its derivative v."""
+    """Return `kind`, or SEPARATE if the duration h is so short that rounding of q would spoil the derivative v of q."""
     n = tolerances.size - ATOL
     for m in range(n):
         atol, rtol = tolerances[ATOL + m], tolerances[RTOL]
@@ -157,7 +157,7 @@ def interpolate_states(f, w, tolerance, tolerances, t, states, groups, times, z,
     """Store [q, v] at times[p] in row p of `out`; return the number of failed projections.
 
     The values of polynomials are projected onto the constraints. A projection fails if dependent coordinates cannot be
-    determined, or if rounding dominates the projected velocities near a singular position; then the values of the
+    determined, or if rounding dominates the projected velocities near a singular position. In both cases, the values of
     polynomials are stored. `groups`: the table of intervals of data/indices.py; `tolerance`: tolerance of the
     projection; `z`, `coefficients`: scratch.
     """
@@ -171,7 +171,7 @@ def interpolate_states(f, w, tolerance, tolerances, t, states, groups, times, z,
         i, last = groups[g, kinds.FIRST_OWN], groups[g, kinds.LAST_OWN]
         fit = _fit_polynomials(tolerances, t, states, groups[g], z_q, c_q, z_v, c_v)
         kind, h, _, _, _, size, size_v = fit
-        # choose independent coordinates anew in each interval: then its states do not depend on earlier output times
+        # choose independent coordinates anew in each interval, so that results do not depend on earlier output times
         has_partition = False
         for p in range(groups[g, kinds.FIRST_TIME], groups[g, kinds.END_TIME]):
             q, v = out[p, :n], out[p, n : 2 * n]

@@ -1,7 +1,7 @@
 """Compile the LLVM code that twoloop generates for one mechanism, without numba; cache the machine code on disk.
 
 Numba would add about a thousand lines of code to each function, and take ten milliseconds for each line of its source.
-Generated code consists only of arithmetic on numbers in memory. It needs few of LLVM's optimisations, because its
+Generated code consists only of arithmetic on numbers in memory. Few of LLVM's optimisations are needed, because the
 operations are already in a good order.
 """
 

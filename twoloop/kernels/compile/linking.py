@@ -8,8 +8,8 @@ nothing to do in kernels, but take half of its time, are skipped. Loops are neit
 kernel requests it: most loops in kernels are short, so that tests of their length would cost more than is gained.
 
 While a kernel is compiled, `kernel_rules` replaces some functions of numba. One replacement leaves out the code for
-negative indices, which kernels do not use: this code would hide from LLVM that elements are adjacent. It has no effect
-on functions of the user. The other replacements make compilation faster: they cache results that numba would compute
+negative indices, which kernels do not use: this code would hide from LLVM that elements are adjacent. Functions of
+the user keep it. The other replacements make compilation faster: they cache results that numba would compute
 again and again, or do the same work with less code.
 
 Modules that need private parts of numba to generate code import these parts from this module.
@@ -111,7 +111,7 @@ def _emit_element_address(
 
 _numba_call_type: Any = BaseFunction.get_call_type
 _call_signatures: dict[Any, tuple[Any, Any]] = {}
-# by id of an object with options of numba: the object, stored so that no other object gets its id, and its text
+# for the id of an object with options of numba: the object, stored so that no other object gets this id, and its text
 _option_texts: dict[int, tuple[Any, str]] = {}
 
 
@@ -149,7 +149,7 @@ _inlined_code: dict[Any, Any] = {}
 
 
 def _cached_inlined_code(self: Any, function: Any, enable_ssa: bool = False) -> Any:
-    """Return numba's intermediate code of an inlined function, from a cache: numba would analyse it for each call."""
+    """Return numba's intermediate code of an inlined function from a cache; numba would analyse each call anew."""
     if (function, enable_ssa) not in _inlined_code:
         _inlined_code[function, enable_ssa] = _numba_inlined_passes(self, function, enable_ssa)
     self.flags.enable_ssa = enable_ssa
@@ -181,7 +181,7 @@ _numba_load_registries: Any = CPUContext.load_additional_registries
 
 
 def _load_registries_once(self: Any) -> None:
-    """Install numba's implementations of Python and NumPy functions in a context; import them only for the first."""
+    """Install numba's implementations of Python and NumPy functions in a context; import them only once."""
     if self._registries:
         for registry in list(self._registries):
             self.install_registry(registry)

@@ -49,11 +49,11 @@ class Reference(types.Type):
         _REFERENCES[name] = self
         self.arrays = dict(arrays)
         self.dtypes = {field: as_dtype(kind.dtype) for field, kind in self.arrays.items()}
-        # by name of an array element: the field of its array, and its index in this array
+        # for each name of an array element: the field of the array, and the index of the element in the array
         self.elements = {element: (array, i) for array, named in elements.items() for element, i in named.items()}
         self.functions: dict[str, Signature] = {}
         self.llvm_functions: set[str] = set()  # fields in `functions` whose functions are generated as LLVM code
-        self.offsets: dict[str, int] = {}  # by field: index of its address in the table; the sizes of an array follow
+        self.offsets: dict[str, int] = {}  # index of a field's address in the table; sizes of an array follow
         self.n_words = 0  # length of the table so far
         self._addresses: Any = BoundedCache()  # addresses of machine code, by the tuple of all functions of a structure
         for field, kind in self.arrays.items():
@@ -80,7 +80,7 @@ class Reference(types.Type):
         _define_call(self, field, signature)
 
     def add_llvm_functions(self, signatures: Mapping[str, Signature]) -> None:
-        """Add fields for generated functions; callers must check that the address is not 0, as one may be missing."""
+        """Add fields for generated functions; callers must check that the address is not 0 (missing function)."""
         for field, signature in signatures.items():
             self.functions[field] = signature
             self.llvm_functions.add(field)
@@ -145,7 +145,7 @@ def _unbox(typ: Any, obj: Any, c: Any) -> NativeValue:
 
 
 def _load_word(context: Any, builder: Any, pointer: Any, offset: int, kind: Any) -> Any:
-    """Emit code that loads entry `offset` (64 bits) of the table at `pointer`; tell LLVM that it never changes."""
+    """Emit code that loads entry `offset` (64 bits) of the table at `pointer`; tell LLVM that the entry is constant."""
     slot = builder.gep(builder.bitcast(pointer, ir.IntType(64).as_pointer()), [ir.Constant(ir.IntType(64), offset)])
     word = builder.load(builder.bitcast(slot, kind.as_pointer()))
     word.set_metadata("invariant.load", builder.module.add_metadata([]))

@@ -8,16 +8,16 @@ ahead of the step (`f`: kit, `w`: workspace), which costs less than evaluations 
   samples exceeds a tenth of their range. The step must end at such a change, or where a value is not finite.
 - If forces may change suddenly with position or velocity, and steps are longer than the time between samples, samples
   are taken along the motion, extrapolated by a parabola from the present position, velocity and acceleration.
-- All other samples are taken with q and v fixed, as they are where the step begins. The time between them is also
-  limited to a fraction of the step size.
+- All other samples are taken with q and v fixed, as they are where the step begins. The time between these samples is
+  also limited to a fraction of the step size.
 - The shortest time between two changes, and the shortest duration of a pulse within a short step, are recorded. If the
   time between samples is not much shorter, other changes as short may have been missed: a message says so.
 
 A jump of C_t or b, for example at the end of a ramp in a drive, changes velocities as an impulse does. Methods that
 correct only dependent velocities after the jump would violate the balance of momentum. So, if velocities change in a
-step by more than accelerations explain, C_t and b are sampled at thirteen times in the step. If they are smooth, the
-twelfth difference of these samples is almost zero, and falls by 2^12 if the time span is halved. If C_t or b jumps, it
-is as large as the jump, also in that half of the time span that contains the jump.
+step by more than accelerations explain, C_t and b are sampled at thirteen times in the step. If C_t and b are smooth,
+the twelfth difference of these samples is almost zero, and falls by 2^12 if the time span is halved. If C_t or b jumps,
+the difference is as large as the jump, also in that half of the time span that contains the jump.
 """
 
 import numpy as np
@@ -30,16 +30,16 @@ from twoloop.kernels.evaluation.constraints import constraint_rates, representab
 from twoloop.kernels.linalg.dense import largest_of
 from twoloop.kernels.linalg.symbolic_factorization import jacobian_entries_of
 
-N_PARTS = 12  # number of equal parts of a time span; C_t and b are sampled at their ends, at 13 times
-# factors of these 13 samples in their twelfth difference
+N_PARTS = 12  # number of equal parts of a time span; C_t and b are sampled at the 13 ends of these parts
+# factors of 13 samples in the twelfth difference, which is almost zero for samples of a smooth function
 BINOMIAL = (1.0, -12.0, 66.0, -220.0, 495.0, -792.0, 924.0, -792.0, 495.0, -220.0, 66.0, -12.0, 1.0)
 MAX_BISECTIONS = 60  # largest number of bisections that locate a jump or a ramp of C_t or b
 RATE_ROUNDING = 1e-11  # error of the twelfth difference due to rounding of samples, relative to the largest sample
 TIME_ROUNDING = 5e3  # error of the twelfth difference due to rounding of t, relative to np.spacing(t) * (mean slope)
-STEEPNESS = 4.0  # a part of a step is a ramp if C_t or b is this number of times steeper there than in the whole step
+STEEPNESS = 4.0  # a part of a step is a ramp if C_t or b is this many times steeper in the part than in the whole step
 MAX_RAMP_SHARE = 0.125  # only a ramp of C_t or b that takes at most this fraction of a step is located within the step
 MIN_SPACINGS = 8.0  # bisection for a jump ends at a time span of this number of spacings of floating-point numbers
-SMOOTH, RAMP, JUMP = range(3)  # C_t and b in a time span: smooth, or with a steep ramp or a kink, or with a jump
+SMOOTH, RAMP, JUMP = range(3)  # C_t and b in a time span are SMOOTH, or have a steep RAMP or a kink, or have a JUMP
 
 
 @compiled
@@ -93,7 +93,7 @@ def _allowed_error(f, w, tolerances, v, row):
 
 @compiled
 def unexplained_velocity_change(tolerances, h, state, new_state, n):
-    """Return the largest difference, in tolerances, of a velocity's change in a step and h times mean acceleration."""
+    """Return the largest difference (tolerances) between a change of velocity in a step and h * (mean acceleration)."""
     largest = 0.0
     for m in range(n):
         v, v1, a, a1 = state[n + m], new_state[n + m], state[2 * n + m], new_state[2 * n + m]
@@ -106,8 +106,8 @@ def unexplained_velocity_change(tolerances, h, state, new_state, n):
 def locate_discontinuity(f, w, t, end, q, v, velocity, tolerances):
     """Search the least smooth of C_t and b from t to `end`; return SMOOTH, RAMP or JUMP, and two times (s).
 
-    The times are the ends of the jump or ramp; t and `end` if all is smooth. If a ramp fills the time span, they are
-    the ends of its first half: a method that evaluates accelerations only at the ends of a ramp, where they may be
+    The times are the ends of the jump or ramp; t and `end` if all is smooth. If a ramp fills the time span, return the
+    ends of its first half: a method that evaluates accelerations only at the ends of a ramp, where they may be
     zero, would miss the ramp. (q, v): state at t. C_t and b are sampled at positions q + velocity * (time - t).
     """
     begin = t
@@ -162,8 +162,8 @@ SUDDEN_RATIO = 0.1  # a change is sudden if the second difference exceeds this f
 # a force, C_t or b counts as constant if its samples differ by at most LEAST_RANGE * rtol times the largest value so
 # far, or by at most LEAST_VALUE, as squares of smaller numbers underflow
 LEAST_RANGE, LEAST_VALUE = 0.1, 1e-150
-MIN_SAMPLES_IN_STEP = 8.0  # least number of samples in a step: all stages may miss a force that lasts a quarter of it
-RESAMPLE_BELOW = 0.25  # sample again if the time between samples must be below this fraction of its last value
+MIN_SAMPLES_IN_STEP = 8.0  # least number of samples in a step: stages may miss a force that lasts a quarter of a step
+RESAMPLE_BELOW = 0.25  # sample again if the time between samples must be below this fraction of the last such time
 MIN_SPACING = 16.0  # shortest time between samples, in spacings of floating-point numbers at t
 N_BISECTIONS = 20  # number of bisections that locate the time of a change between two samples
 EQUAL_CHANGES = 1e-5  # two changes are the same if their times differ by at most this part of clock[WIDEST_SAMPLING]
@@ -171,12 +171,12 @@ EQUAL_CHANGES = 1e-5  # two changes are the same if their times differ by at mos
 # errors make a force that begins at zero, such as 1 - cos(t), seem to change suddenly
 MIN_RECORDED_TIME = 5e-5
 MIN_STEEPNESS_RATIO = 2.0  # a change between two samples is sudden if it exceeds this times the changes next to it
-SHORT_STEP = 0.5  # a step below this fraction of the longest recent step may be short because of a pulse: search for it
+SHORT_STEP = 0.5  # steps below this fraction of the longest recent step are searched for pulses of forces, C_t and b
 N_SAMPLES_IN_SHORT_STEP = 4  # number of samples within a short step, in search of pulses
 # accelerations do not last if one of them changes by more than this fraction of the largest, when velocities change by
 # their tolerances, see `_acceleration_lasts`
 MAX_LASTING_CHANGE = 0.5
-# a step need not end at a change that is at most this fraction of the time between samples after its beginning
+# a step need not end at a change if the step begins before it by at most this fraction of the time between samples
 CHANGE_MARGIN = 0.01
 # w.changes has a column for each force, C_t and b; its rows 0 to N_SAMPLES contain the samples of one set
 LARGEST_ROW = N_SAMPLES + 1  # row of w.changes: largest |value| of each force, C_t and b so far
@@ -252,7 +252,7 @@ def _first_sudden_bend(values, n, detrends, min_range):
 
 @compiled
 def _is_sudden_change(previous, first_value, second_value, following, limit):
-    """Return True if the two middle samples of four differ by more than `limit`, and much more than from the others."""
+    """Return True if the middle two of four samples differ by more than `limit`, and more than other neighbours."""
     change = second_value - first_value
     sign = 1.0 if change > 0.0 else -1.0
     neighbouring_change = max(sign * (first_value - previous), sign * (following - second_value))
@@ -279,7 +279,7 @@ def _locate_change(f, w, low, high, k, j, q, v, a):
 def _record_changes(f, w, tolerances, clock, t, begin, spacing, n, index, column, limit, q, v, a):
     """Record sudden changes just before and after sample `index`, where a force, C_t or b has a sudden bend.
 
-    Store the time of the last in clock[LAST_CHANGE], and the shortest time between two, in clock[SHORTEST_CHANGE].
+    Store the time of the last change in clock[LAST_CHANGE], the shortest time between two in clock[SHORTEST_CHANGE].
     Samples k = 0 to n, at begin + k * spacing, are in this `column` of w.changes. Changes up to `limit` are not sudden.
     """
     values, margin = w.changes[:, column], max(CHANGE_MARGIN * spacing, EQUAL_CHANGES * clock[at.WIDEST_SAMPLING])
@@ -304,7 +304,7 @@ def first_discontinuity(f, w, tolerances, clock, t, begin, spacing, last, follow
     """Take a set of samples of forces, C_t and b; return the times (s) of the first sudden change and the last sample.
 
     If there is no sudden change, its time is infinite. (q, v, a): state at t. The first sample is at `begin`, the
-    last one not after `last`. follows_motion: 1: samples along the extrapolated motion; 0: at the fixed state (q, v).
+    last one not after `last`. `follows_motion`: 1 for samples along the extrapolated motion, 0 at fixed (q, v).
     """
     changes, n, t_first = w.changes, 0, np.inf
     for k in range(N_SAMPLES + 1):
@@ -366,7 +366,7 @@ def _record_short_change(f, w, tolerances, control, clock, t, size, last, q, v, 
 def _acceleration_lasts(f, w, tolerances, t, duration, q, v, a, Q, V, A):
     """Return True if accelerations hardly change when velocities change by their tolerances.
 
-    They change much if stiff friction holds a body: the accelerations are then rounding errors of balanced forces, and
+    If stiff friction holds a body, they change much: the accelerations are rounding errors of balanced forces, and
     must not be used to extrapolate the motion over `duration` (s). (Q, V, A) is scratch.
     """
     n, time, largest, change = w.Q.size, duration, 0.0, 0.0
@@ -389,7 +389,7 @@ def _acceleration_lasts(f, w, tolerances, t, duration, q, v, a, Q, V, A):
 def _sample_motion(f, w, tolerances, control, clock, spacing, t, size, last, q, v, a, Q, V, A):
     """If earlier samples along the motion end within the step, take new ones; store the next sudden change in `clock`.
 
-    They extend from t over the step size, or over MIN_TIME_AHEAD times `spacing` if longer, but not beyond `last`.
+    New samples extend from t over the step size or, if longer, MIN_TIME_AHEAD times `spacing`, but not beyond `last`.
     """
     if clock[at.MOTION_SAMPLED_TO] >= t + (1.0 - CHANGE_MARGIN) * size:
         return
@@ -404,7 +404,7 @@ def _sample_motion(f, w, tolerances, control, clock, spacing, t, size, last, q, 
             f, w, tolerances, clock, t, t, duration / N_SAMPLES, last, 1.0, q, v, A
         )
     clock[at.SAMPLES_MOTION] = 0.0
-    # samples along the motion, if close enough, also replace those at a fixed state, unless these end at a change
+    # samples along the motion, if close enough, replace samples at a fixed state, unless the latter end at a change
     change_found = clock[at.SAMPLED_TO] == clock[at.DISCONTINUITY] > t
     if not change_found and duration <= N_SAMPLES * min(control[at.TIME_SPACING], size / MIN_SAMPLES_IN_STEP):
         clock[at.WIDEST_SAMPLING] = max(clock[at.WIDEST_SAMPLING], duration / N_SAMPLES)

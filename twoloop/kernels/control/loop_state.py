@@ -1,7 +1,7 @@
 """Indices into `control` and `clock`, the arrays of the integration loop, and the codes that `advance` returns.
 
 `advance` (kernels/advance.py) is the loop over steps. `control` contains its settings; the first entries are the
-parameters of step-size control. `clock` contains its state, such as the present time, from which the next call of
+parameters of step-size control. `clock` contains variables, such as the present time, from which the next call of
 `advance` continues; the first entries are the history of step-size control.
 """
 
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
     ROWS_VIOLATED,  # constraints that counted as redundant are violated at the end of a step
     NEAR_SINGULAR,  # a singular position is near: the caller crosses it by special steps
     SWITCH_METHOD,  # the method does not suit the motion: the caller continues with another method
-    AT_DISCONTINUITY,  # a constraint rate, C_t or b, jumps at this time: the caller computes the state after the jump
+    AT_DISCONTINUITY,  # constraint rate C_t or b jumps just after clock[T]: the caller computes the state after the jump
     NEEDS_DENSE,  # the fixed-order form cannot decide which rows are independent: the caller uses a dense form
     NEEDS_COMPILATION,  # the step has no machine code yet: the caller compiles it, then calls `advance` again
 ) = range(12)
@@ -45,7 +45,7 @@ H_BEFORE, ERROR_BEFORE, N_PAST = range(3)
     SYMMETRIC,  # 1: each step chooses the partition at its midpoint; 0: a partition is kept as long as it is good
     MAX_ATTEMPTS,  # number of attempted steps after which `advance` returns; its caller then checks progress and time
     # 1: near a singular position, `advance` returns NEAR_SINGULAR, and the caller crosses the position. 0: `advance`
-    # never does so. SUSPENDED: it does not do so near the present singular position; far from it, 1 is stored again
+    # never returns this code. SUSPENDED: not returned near the present singular position; far from there, 1 is stored
     MAY_CROSS,
     SHORTEST,  # steps must be longer than this (s), and longer than EQUAL_SPACINGS spacings of floating-point times
     MAY_SWITCH,  # 1: `advance` returns SWITCH_METHOD if a value is not finite, or a step returns UNSUITED; 0: never
@@ -88,7 +88,7 @@ H, ERRORS, FAILURES, PARTITIONS, JACOBIANS, N_STEP_COLUMNS = range(6)
     JUMP_TO,  # end (s) of the short time span with the next known jump of a constraint rate (C_t, b)
     APPLIES_JUMP,  # 1: the next step ends at JUMP_TO, in the state that `new_state` already contains; 0: ordinary step
     JUMP_END,  # end (s) of the last step rejected with a very large error: a force may jump before this time
-    # fixed-order form: smallest pivot at the end of the last accepted step, or of a later one that `ends_near_singular`
+    # fixed-order form: smallest pivot at the end of the last accepted step, or of a later step near a singular position
     PIVOT_HERE,
     # samples of forces, C_t and b ahead of a step: at a fixed state, where the step begins, or along predicted motion
     SAMPLED_TO,  # time (s) of the last sample at a fixed state

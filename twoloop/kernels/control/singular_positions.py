@@ -27,8 +27,8 @@ FREEDOMS_PER_CHECK = 32
 N_CHECKED_PARTS = 8  # number of equal parts of a step between which `comes_near_singular` computes the smallest pivot
 # pivots within a step are computed if the smallest pivot at one of its ends is below this part of clock[LARGEST_PIVOT]
 MAX_UNCHECKED_PIVOT = 0.5
-# `comes_near_singular` samples the smallest pivot in a step. Between two samples it may be zero if one of them is below
-# this fraction of the largest difference of successive samples
+# `comes_near_singular` samples the smallest pivot in a step. The pivot may be zero between two samples if one sample is
+# below this fraction of the largest difference of successive samples
 PASSED_PIVOT_RATIO = 0.6
 # MIN_NEAR_RATIO, MAX_NEAR_RATIO: limits of the result of `near_pivot_ratio`. MAX_ROUNDING_ERROR: allowed rounding error
 # near a singular position, in tolerances. EPS: unit roundoff
@@ -40,8 +40,8 @@ MIN_END_RATIO = 0.25  # `ends_near_singular` is True only if the smallest pivot 
 def is_near_singular(f, w, control, clock, t, q):
     """Return True if a singular position is near the accepted position q at time t, and control[MAY_CROSS] is 1.
 
-    It is near if the smallest pivot of C_q is small, or if no partition can be chosen. If w.pivot, from the last choice
-    of a partition, is small, or may be old (with generated code, which needs no partition), choose a new one first.
+    A position is near if the smallest pivot of C_q is small, or if no partition can be chosen. If the pivot of the last
+    partition, w.pivot, is small or may be old (generated code needs no partition), choose a new partition first.
     """
     if control[at.MAY_CROSS] != 1.0:
         return False
@@ -55,7 +55,7 @@ def is_near_singular(f, w, control, clock, t, q):
 def ends_near_singular(f, w, control, clock):
     """Return True if a step of the fixed-order form ends so near a singular position that no step should begin there.
 
-    The caller then repeats it with another size: a singular position within a step does no harm. Return False if the
+    The caller then repeats the step with another size: a singular position within it does no harm. Return False if the
     smallest pivot is not much smaller than where the step begins, or for steps of fixed size.
     """
     if f.form != FIXED_ORDER or control[at.FIXED_STEP] > 0.0:
@@ -74,9 +74,9 @@ def is_too_short_near_singular(f, clock, size):
 def prepare_projected_repetition(f, w, control, clock, size):
     """Return True if a rejected or failed step of the fixed-order form is repeated near a singular position.
 
-    Stages that violate the constraints have inaccurate accelerations there: set w.nearly_singular so that they are
-    projected. Store the size of the repetition in clock[H_NEXT]. The first one is at least as long as clock[H_LONG], a
-    recent long step, because it may succeed if it ends well beyond the position; each further one is shorter.
+    Stages that violate the constraints have inaccurate accelerations there: set w.nearly_singular so that stages are
+    projected. Store the step size in clock[H_NEXT]. The first repetition is at least as long as clock[H_LONG], a recent
+    long step, because it may succeed if it ends well beyond the position; each further repetition is shorter.
     """
     is_near = clock[at.PIVOT_HERE] < REPEAT_PIVOT * clock[at.LARGEST_PIVOT]
     if f.form != FIXED_ORDER or control[at.FIXED_STEP] > 0.0 or w.nearly_singular == 1.0 or not is_near:
@@ -100,7 +100,7 @@ def _smallest_pivot_within_step(f, w, t, size, before, end, state, new_state):
     """Sample the smallest pivot of C_q within a step; return the least sample, and the largest change between samples.
 
     The step of size `size` (s) leads from `state`, at t, to `new_state`. `before` and `end` are the samples at these
-    states. The other samples are at positions on the cubic through them.
+    states. The other samples are at positions on the cubic curve through these states.
     """
     n, least, change = w.Q.size, min(before, end), 0.0
     for k in range(1, N_CHECKED_PARTS):
@@ -119,7 +119,7 @@ def _smallest_pivot_within_step(f, w, t, size, before, end, state, new_state):
 def comes_near_singular(f, w, control, clock, tolerances, t, size, state, new_state):
     """Return True if a step with a small error estimate comes so near a singular position that it must be discarded.
 
-    Rounding errors of its stages may then exceed the tolerances. Only runs that have come near a singular position
+    Rounding errors of the stages may then exceed the tolerances. Only runs that have come near a singular position
     are checked. If control[MAY_CROSS] is SUSPENDED, return False, and record the smallest pivot in clock[PIVOT_PASSED].
     If the pivots at both ends of the step are large, set control[MAY_CROSS] to 1.
     """
@@ -194,7 +194,7 @@ def check_partition(f, w, control, clock, size, at_output, state):
         # w.pivot was computed when the partition was chosen: an old value may hide that a singular position is near
         if renew_partition(f, w, clock[at.T], state[:n]) != DONE:
             return at.RANK_LOST
-        w.sensitivity = 1.0  # its value far from singular positions, so that `partition_is_poor` soon is True again
+        w.sensitivity = 1.0  # value far from singular positions, so that `partition_is_poor` soon is True again
         if w.pivot < SINGULAR_PIVOT * clock[at.LARGEST_PIVOT]:
             w.nearly_singular = w.near_now = 1.0
     if short and size < MIN_STEP_NEAR_SINGULAR * clock[at.H_LONG] and w.nearly_singular == 1.0:

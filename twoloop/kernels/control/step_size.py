@@ -14,7 +14,7 @@ Two measures show errors that the error estimate of the integration formula miss
   nearly exact. So if the sign changes in a step, its prediction must be nearly exact.
 - `defect_ratio` measures the defect of a Taylor step: the difference, at the same state, between accelerations by the
   series and by the equations. The series knows the forces at the beginning of the step only, not a later sudden
-  change. So the equations are evaluated at the end of the step and, if it is longer than DEFECT_GAP, also within it.
+  change. So the equations are evaluated at the end of the step and, if the step exceeds DEFECT_GAP, also within it.
 """
 
 import numpy as np
@@ -105,7 +105,7 @@ def size_on_grid(clock, t, h, target, goal):
 
 @merged
 def size_off_grid(control, t, h, left, crosses_jump):
-    """Return the size (s) of a step, about h at most, and True if it ends at t + left, as it must if `crosses_jump`."""
+    """Return a step size (s) up to about h, and True if the step ends at t + left instead: always if `crosses_jump`."""
     reaches_goal = crosses_jump or h >= left * (1.0 - 1e-10)
     size = h
     if h > 0.5 * left and not reaches_goal:
@@ -121,7 +121,7 @@ H_LONG_DECAY = 0.98  # factor by which each accepted step reduces clock[H_LONG],
 
 @merged
 def count_step(w, tolerances, control, clock, size, out_step):
-    """Count an accepted step of size `size` (s): update clock[H_LONG] and statistics in w; fill its row `out_step`."""
+    """Count an accepted step of size `size` (s): update clock[H_LONG] and statistics in w; fill `out_step`."""
     w.n_accepted += 1
     if w.defect >= 0.0:
         w.largest_defect = max(w.largest_defect, w.defect)
@@ -146,7 +146,7 @@ def count_step(w, tolerances, control, clock, size, out_step):
 FRACTION_OF_MOTION = 0.1
 FRACTION_AT_SIGN_CHANGE = 1e-6  # replaces FRACTION_OF_MOTION if det C_qd (dependent columns of C_q) changes sign
 LEAST = 1e-300  # lower bound of the allowed error of a predicted position, which avoids a division by zero
-FIXED_FRACTION = 0.01  # this fraction of the tolerance is also allowed, for steps in which coordinates hardly move
+FIXED_FRACTION = 0.01  # part of the tolerance by which predictions may differ, even if coordinates hardly move
 
 
 @merged
@@ -162,7 +162,7 @@ def prediction_error(w, tolerances, h, q, v, q1):
 
     q1 satisfies the constraints; the integration formula predicted w.predicted. The allowed error is the tolerance or,
     if smaller, about FRACTION_OF_MOTION (if det C_qd changes sign: FRACTION_AT_SIGN_CHANGE) times the displacement.
-    Store the sign in w.orientation_new, from factors of C_qd at q1, which `w` must contain. For fixed steps, return 0.
+    Store the sign of det C_qd at q1 in w.orientation_new, by the factors that `w` must contain. Fixed steps: return 0.
     """
     if tolerances[ESTIMATE] == 0.0:
         return 0.0

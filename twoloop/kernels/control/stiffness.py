@@ -4,7 +4,7 @@ The largest rate of the motion, rho (1/s), is the larger of two numbers: the squ
 dF/dq, and the largest eigenvalue of dF/dv, where F(q, v) are the accelerations. From time to time, a few power
 iterations of one evaluation each estimate rho. Let h be the step size. If h rho is well below the stability limit of
 the explicit method, the motion is not stiff. Near the limit, either stiffness or accuracy may determine h. Then a trial
-begins: the implicit method takes some steps, with its errors multiplied by ten. It stays if it costs less per second.
+begins: the implicit method takes some steps, with its errors multiplied by ten, and stays if it costs less per second.
 
 A trial also begins at smaller h rho in three cases:
 
@@ -50,13 +50,13 @@ from twoloop.kernels.data.indices import DONE, ESTIMATE, FIXED_ORDER, GAP, MAX_G
 from twoloop.kernels.evaluation.inner_loop import renew_partition
 from twoloop.kernels.linalg.dense import copy
 
-# the largest rate is first estimated after FIRST_ESTIMATE evaluations of the equations, then every BETWEEN_ESTIMATES.
-# An estimate takes about eight. While the explicit method is active, both numbers are multiplied by options[COST_RATIO]
+# the largest rate is first estimated after FIRST_ESTIMATE evaluations of the equations, then every BETWEEN_ESTIMATES;
+# these numbers are multiplied by options[COST_RATIO] while the explicit method is active. An estimate takes about eight
 FIRST_ESTIMATE, BETWEEN_ESTIMATES = 100.0, 600.0
 N_POWER_ITERATIONS = 4  # number of power iterations by dF/dq per estimate (F: accelerations); largest number by dF/dv
 NEGLIGIBLE_DAMPING = 1e-3  # power iterations by dF/dv end early if the eigenvalue times the step size is below this
 ZERO_REPLACEMENT = 1e-3  # replaces zero components of the vector of a power iteration, whose largest component is 1
-STABILITY_LIMIT = 3.0  # a trial begins at any cost if step size * (largest rate) exceeds this times its stability limit
+STABILITY_LIMIT = 3.0  # a trial begins at any cost if step size * (largest rate) exceeds this times options[LIMIT]
 # if Jacobians are computed by finite differences (about eight evaluations per coordinate), a trial that STABILITY_LIMIT
 # does not require also waits until the run has cost this number of evaluations per independent coordinate
 MIN_COST_PER_COORDINATE = 64.0
@@ -68,10 +68,10 @@ COUNTED_FRACTION_OF_RUN = 0.3  # the cost so far counts as at least this fractio
 COST_OF_ANY_TRIAL = 100.0
 MIN_RATIO_TO_MOTION = 30.0  # above this times `_motion_rate`, the largest rate is "hidden": the motion does not show it
 QUIET_FACTOR = 10.0  # vibrations count as small if their velocities are at most this number of tolerances
-# step size * (largest rate) / LIMIT above which a trial begins if this rate is hidden, or is that of small vibrations
+# step size * (largest rate) / options[LIMIT] above which a trial begins if the rate is hidden or of small vibrations
 MIN_HIDDEN_RATIO = 0.05
 DIFFERENCE_STEP = 1e-4  # time step of the finite difference in `_motion_rate`, relative to 1 / (largest rate)
-RETURN_BELOW = 0.4  # the explicit method is tried again if step size * (largest rate) is below this part of its limit
+RETURN_BELOW = 0.4  # the explicit method is tried again if step size * (largest rate) / options[LIMIT] is below this
 TRIAL_ERROR_FACTOR = 10.0  # multiplies errors of the implicit method on trial, so that it cannot win by larger errors
 MEAN_WEIGHT = 0.8  # after a step: new mean step size = MEAN_WEIGHT * old mean + (1 - MEAN_WEIGHT) * size of the step
 N_UNMEASURED_STEPS = 5.0  # number of accepted steps at the beginning of a trial that do not count in its cost
@@ -85,7 +85,7 @@ EXPLICIT, ON_TRIAL, IMPLICIT, BACK_ON_TRIAL = range(4)
 
 # `options` contains N_PAIR options of the pair (indices below); N_OF_EACH numbers for each method, namely parameters of
 # step-size control (loop_state.py) and, at REUSE_OF, w.reuse; and the options of the first and the second method.
-# - LIMIT: stability limit of step size * (largest rate). After N_ESTIMATES estimates above it, a trial begins
+# - LIMIT: stability limit of step size * (largest rate). After N_ESTIMATES estimates above LIMIT, a trial begins
 # - MATRIX_COST: cost of a Jacobian, in evaluations of accelerations
 # - COST_RATIO: cost of an evaluation by the second (implicit) method, in evaluations by the first (explicit) one
 # - SIZE_1: number of options of the first method
@@ -113,7 +113,7 @@ N_OPTIONS = N_PAIR + 2 * N_OF_EACH  # index in `options` where the options of th
     H_TRIED,  # size of the last attempted step (s)
     ERROR_TRIED,  # error of the last attempted step, in tolerances
     N_TRIALS,  # number of trials so far
-    # number of estimates of step size * (largest rate) above LIMIT; one below it sets this to 0 if a trial could begin
+    # number of estimates of step size * (largest rate) above LIMIT; a lower estimate resets it if a trial could begin
     N_ABOVE_LIMIT,
     N_SCALARS,
 ) = range(19)
@@ -131,7 +131,7 @@ def switching_options(
     """Return the array `options` of a pair of methods, the first one explicit, the second one implicit.
 
     `limit`, `estimates`, `matrix_cost` and `ratio` are the values of LIMIT, N_ESTIMATES, MATRIX_COST and COST_RATIO.
-    `rules` has a row for each method: parameters of step-size control and w.reuse. `first`, `second`: their options.
+    `rules` has a row for each method: parameters of step-size control and w.reuse. `first`, `second`: options.
     """
     first = np.asarray(first)  # numbers or, for code that is compiled for all parameters, expressions of parameters
     scalars = [limit, float(estimates), matrix_cost, ratio, float(first.size)]
@@ -167,8 +167,8 @@ def _method_memories(memory, n):
 def _power_iteration(f, w, t, state, direction, by_v, Q, V, A):
     """Take one power iteration: multiply `direction` (n_q) by dF/dq or, if `by_v` is True, by dF/dv (F: accelerations).
 
-    Only components of independent coordinates are used. Scale the product to a largest |component| of 1. Return its
-    growth, an estimate of the largest eigenvalue; 0 if F cannot be evaluated. (Q, V, A) is scratch.
+    Only components of independent coordinates are used. Scale the product to a largest |component| of 1. Return the
+    factor of growth, an estimate of the largest |eigenvalue|; 0 if F cannot be evaluated. (Q, V, A) is scratch.
     """
     n = Q.size
     q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]
@@ -224,7 +224,7 @@ def _largest_rate(f, w, memory, t, state, new_state):
 def _motion_rate(f, w, t, state, rate, Q, V, A):
     """Return the rate (1/s) at which the motion changes: the larger of max|a| / max|v| and max|da/dt| / max|a|.
 
-    Return inf if it is unknown. `rate`: largest rate rho, which sets the time step for da/dt. (Q, V, A): scratch.
+    Return inf if this is unknown. `rate`: largest rate rho, which sets the time step for da/dt. (Q, V, A): scratch.
     """
     n = Q.size
     dt = DIFFERENCE_STEP / rate
@@ -247,7 +247,7 @@ def _motion_rate(f, w, t, state, rate, Q, V, A):
 def _has_small_vibrations(w, tolerances, state, rate):
     """Return True if vibrations of angular frequency `rate` (1/s) have velocities of at most QUIET_FACTOR tolerances.
 
-    The amplitude of their velocities is a / rate, where the amplitude of accelerations, a, is taken from `state`.
+    The amplitude of velocities is a / rate, where the amplitude a of accelerations is taken from `state`.
     """
     n = w.Q.size
     for i in w.independent_v:
@@ -287,7 +287,7 @@ def _begin_phase(w, options, memory, phase, t):
 
 @compiled
 def _judge_trial(w, options, memory, t):
-    """Compare costs at the end of a trial; return the phase that follows, EXPLICIT or IMPLICIT; -1: it continues."""
+    """Compare costs at the end of a trial; return the next phase, EXPLICIT or IMPLICIT; -1: the trial continues."""
     if memory[STEPS] == N_UNMEASURED_STEPS:
         memory[T_BEGIN], memory[COST_BEGIN] = t, _cost_of_run(w, options)
     if memory[STEPS] < N_UNMEASURED_STEPS + N_MEASURED_STEPS:
@@ -369,8 +369,8 @@ def commit_switching(f, w, options, memory, tolerances, accepted):
 def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
     """Attempt a step by the active method; but first begin or end a trial of the other method, if it is due.
 
-    This is decided after accepted steps, and not for steps of fixed size. The memory of a method is set to zero when
-    it becomes active. Each method has its own parameters of step-size control.
+    A trial begins or ends only after accepted steps, and never with steps of fixed size. The memory of a method is set
+    to zero when the method becomes active. Each method has its own parameters of step-size control.
     """
     n = w.Q.size
     first, second = _method_memories(memory, n)
@@ -403,7 +403,7 @@ def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
             w.explicit_step = 0.0
             code, error, factor = f.attempt_second(f, w, options[begin:], second, t, h, tolerances, state, new_state)
     else:
-        # only the first method evaluates the equations within its steps: only they may be longer than tolerances[GAP]
+        # only the first method evaluates the equations within steps: only its steps may be longer than tolerances[GAP]
         ratio = gap_ratio(tolerances, h)
         if ratio > 0.0:
             return Attempt(DONE, ratio, 1.0 / ratio)

@@ -63,7 +63,7 @@ class Work(NamedTuple):
     G_of_S: Any  # (n_c + n_a, n_q) if M is constant: the G for which S and W were computed; NaN: S and W are invalid
     pattern: Any  # (n_c + n_a, n_q) 1 for entries of the constraint Jacobian that have been nonzero in the run, else 0
     mass_pattern: Any  # (n_q, n_q) 1 for entries of M that have been nonzero, else 0; only in the form AUGMENTED
-    row_entries: Any  # for each row of G, the index in this array of its list of columns with entries; then the lists
+    row_entries: Any  # indices in this array: where the list of nonzero columns of each row of G begins; then the lists
     Gamma_tried: Any  # (2, n_c + n_a) Gamma by finite differences: with twice the time step; with the one tried before
     rates: Any  # (13, n_c + n_a) constraint rates C_t and b at 13 times within a step, see discontinuities.py
     changes: Any  # (N_CHANGES, n_q + n_c + n_a) samples of forces and constraint rates, see discontinuities.py
@@ -192,14 +192,14 @@ OWN_FUNCTIONS = {
     "own_accelerate": types.boolean(f8, VECTOR, VECTOR, VECTOR, VECTOR),  # accelerations
     "own_correct_positions": types.boolean(f8, VECTOR, VECTOR, VECTOR, VECTOR, VECTOR),  # correction of q, corrected q
     "own_project": types.boolean(f8, *[VECTOR] * 8),  # accelerations, correction of q, corrected q and v, multipliers
-    "own_redundant": types.boolean(f8, VECTOR, VECTOR, VECTOR, VECTOR),  # none; True: redundant rows are satisfied
+    "own_redundant": types.boolean(f8, VECTOR, VECTOR, VECTOR, VECTOR),  # nothing; True: redundant rows are satisfied
     # functions of collocation steps; `memory` is described in data/collocation.py, `numbers` is f.own_numbers
     "attempt_nodes": f8(*[VECTOR] * 4),  # (memory, state, tolerances, numbers): solve for stages; code: CONVERGED, ...
     "audit_nodes": f8(*[VECTOR] * 3),  # (memory, state, numbers): return the largest defect between nodes; -1: failure
     "retry_nodes": types.none(*[VECTOR] * 2),  # (memory, state): predict a shorter step from a rejected one
     "end_nodes": types.none(*[VECTOR] * 3),  # (memory, state, new_state): compute the state at the end of the step
     "correct_ends": types.none(*[VECTOR] * 2),  # (memory, numbers): move the ends of eight steps towards C = 0
-    "project_ends": types.none(*[VECTOR] * 2),  # (memory, numbers): project these ends; compute a and multipliers
+    "project_ends": types.none(*[VECTOR] * 2),  # (memory, numbers): project ends of eight steps; compute a, lam
 }
 KIT.add_llvm_functions(OWN_FUNCTIONS)
 
@@ -306,9 +306,9 @@ class Kit:
     """Functions and data of a system and a method, passed to kernels as one reference.
 
     `functions`: callbacks and data of the system. `inner`: the inner loop, which may call functions generated for the
-    mechanism (`own`; (): none). `general`: the inner loop for any mechanism, which does what these cannot do. `step`:
-    functions of the method; None: no kernel calls them. `first`, `second`: those of two methods between which the run
-    may switch. `numbers`, `own_numbers`: data that generated functions of a state, and of collocation steps, read.
+    mechanism (`own`; (): none). `general`: the inner loop for any mechanism, which does what generated code cannot do.
+    `step`: functions of the method; None: no kernel calls them. `first`, `second`: functions of two methods between
+    which the run may switch. `numbers`: data for generated functions of a state; `own_numbers`: for collocation steps.
     """
 
     def __init__(
@@ -374,7 +374,7 @@ def finite(A):
 
 @compiled
 def not_finite(w, kind, t, q):
-    """Record which callback (index `kind`; -1: q is not finite) returned NaN or infinity, when; return NOT_FINITE."""
+    """Record t and the index `kind` of the callback that returned NaN or infinity (-1: q has); return NOT_FINITE."""
     w.fault_kind = kind if finite_vector(q) else -1.0
     w.fault_time = t
     return NOT_FINITE

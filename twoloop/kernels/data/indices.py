@@ -17,7 +17,7 @@ from twoloop.kernels.compile.callbacks import OPTIONAL_KINDS
     MASS_NOT_DEFINITE,  # the mass matrix is not positive definite
     GAMMA_INACCURATE,  # finite differences do not yield Gamma as accurately as w.gamma_required
     RANK_DIFFERS,  # the workspace was allocated for other ranks of C_q and [C_q; A] than w.rank and w.rank_v
-    ROWS_CONTRADICT,  # redundant constraints are violated: they contradict the others
+    ROWS_CONTRADICT,  # redundant constraints are violated: they contradict the independent constraints
     NEEDS_DENSE,  # the fixed-order form cannot decide which rows are independent: the caller uses a dense form
     NOT_LOADED,  # the machine code of the step is missing: the caller loads it, then repeats the call
     UNSUITED,  # the method does not suit the motion: the caller continues with another method
@@ -75,7 +75,7 @@ FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN, REACTION_BY_Q_GIVEN, MASS_VALUES_GIVEN = (
     CONTRADICTION,  # with the code ROWS_CONTRADICT: index of a violated row of [C_q; A]
     # smallest pivot of C_q, computed last (rows scaled to maxima of 1; fixed-order form: sine of an angle between rows)
     PIVOT,
-    # 1: the run has come near a singular position, or never checks for one; 2: near one, stages are projected; 0: else
+    # 1: the run has come near a singular position, or never checks this; 2: it is near, stages are projected; 0: else
     NEARLY_SINGULAR,
     NEAR_NOW,  # 1: a singular position was near at the last check; 2: the next check chooses a new partition; 0: else
     MASS_SCALE,  # factor by which M is multiplied in the augmented matrix, see linalg/saddle_point.py
@@ -111,7 +111,7 @@ FLAGS = _group("CONSTANT_MASS", "FIRST_GIVEN") | {f"{kind}_given": index for kin
 (
     RTOL,  # relative tolerance
     ESTIMATE,  # 1: steps estimate their errors; 0: they do not, because the step size is fixed
-    LEAST,  # smallest tolerance of a coordinate or a velocity at the start of the run
+    LEAST,  # the smaller one of the relative tolerance and the smallest absolute tolerance
     GAP,  # longest allowed time (s) between two evaluations of the equations
     DEFECT_GAP,  # longest allowed time (s) between two evaluations in steps that evaluate their defect between nodes
     ATOL,  # index of the first absolute tolerance; there is one for each coordinate and its velocity
@@ -135,7 +135,7 @@ WINDOW = 4  # number of accepted states that a polynomial of dense output interp
     KIND,  # kind of the interval: SEPARATE, VELOCITIES, ACCELERATIONS, ACROSS or JUMP
     FIRST_TIME,  # index of the first output time in the interval
     END_TIME,  # 1 + index of the last output time in the interval
-    LOW,  # index of the first state that the polynomial may interpolate: velocities jump before, or the run starts
-    HIGH,  # index of the last state that the polynomial may interpolate: velocities jump after, or the run ends
+    LOW,  # index of the first state that the polynomial may interpolate: start of the run, or the state after a jump
+    HIGH,  # index of the last state that the polynomial may interpolate: end of the run, or the state before a jump
     N_COLUMNS,
 ) = range(8)

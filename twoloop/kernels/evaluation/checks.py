@@ -430,8 +430,8 @@ def _operation_with_bound(kind, x, bound_x, y, bound_y):
 def _run_trace(program, columns, coefficients, constants, nodes, values, bounds):
     """Run a trace: store its results in `values`, and bounds of their rounding errors, in units of EPS, in `bounds`.
 
-    `program`, `columns`, `coefficients` and `constants` describe its operations. On entry, `nodes` begins with t, q and
-    v; the results of all operations are stored behind them.
+    `program`, `columns`, `coefficients` and `constants` describe the operations. On entry, `nodes` begins with t, q and
+    v; the results of all operations are stored after v.
     """
     for i in range(len(program)):
         first, second, end = program[i, op.FIRST], program[i, op.SECOND], program[i, op.END]

@@ -171,7 +171,7 @@ def _fill_gamma(f, w, t, q, v, e, first, last):
 
 @merged
 def _max_disagreement(w):
-    """Return how much Gamma with the time step e may differ from Gamma with 2 e; its error is smaller than this."""
+    """Return how much Gamma with the time step e may differ from Gamma with 2 e; the error of Gamma is less."""
     return max(w.gamma_required, ROUNDING_DISAGREEMENT) * w.gamma_scale
 
 

@@ -7,8 +7,8 @@ rows A of non-holonomic constraints A v + b = 0; w.D contains the null space of 
 
 If a step integrates all coordinates, its states violate the constraints by the error of the formula. Each iteration of
 a projection moves q and v towards the nearest state on the constraints, in the metric of M. This state does not depend
-on a partition. After it, the error of q is about the square of its correction, but the errors of v and a are about as
-large as the correction: iterations are repeated until the correction is near rounding.
+on a partition. After an iteration, the error of q is about the square of the correction of q, but the errors of v and a
+are about as large as this correction: iterations are repeated until the correction is near rounding.
 """
 
 import numpy as np
@@ -247,7 +247,7 @@ ROUNDING_OF_Q = 2e-14  # a change of q by at most this fraction of max|q| counts
 def _verify_pattern(w):
     """If the constraint Jacobian w.G has nonzero entries where w.pattern is 0, write new programs of elimination.
 
-    Return DONE if it has none, INNER_DIVERGED after new programs, so that the step is repeated, or SINGULAR on failure.
+    Return DONE if w.G has no such entry, INNER_DIVERGED after new programs, to repeat the step, or SINGULAR on failure.
     """
     if not record_entries(w):
         return DONE
@@ -307,7 +307,7 @@ def inner_loop(f, w, task, t, q, v, tolerance, a, lam):
 def evaluate(f, w, t, q, v, tolerance, a):
     """Compute dependent from independent entries of q and v, and the accelerations `a`; return DONE or a failure code.
 
-    Newton's method for q ends after a correction of at most `tolerance`. Up to w.reuse, it keeps the old Jacobian.
+    Newton's method for q ends after a correction of at most `tolerance`; up to w.reuse, the Jacobian is not updated.
     """
     return f.inner(f, w, tasks.EVALUATE, t, q, v, tolerance, a, w.lam)
 

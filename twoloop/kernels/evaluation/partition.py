@@ -356,8 +356,8 @@ def partition_is_poor(w):
         w.sensitivity = max(largest, 1.0)
     if not largest <= SENSITIVITY_GROWTH * w.sensitivity:
         return True
-    # no coefficient is checked without redundant rows, nor in the fixed-order form (w.factors not empty), which chooses
-    # other independent rows when its factors show that some have become dependent
+    # no coefficient is checked if no row is redundant, nor in the fixed-order form (w.factors not empty), which chooses
+    # other independent rows when its factors show that a row has become dependent
     if w.rows_v.size == w.Rate.size or w.factors.size > 0:
         return False
     coefficient = _largest_coefficient(w)
@@ -498,7 +498,7 @@ def find_null_space(f, w, t, q):
 def restore_velocities(f, w, t, q, v, reuse_limit):
     """Compute the dependent velocities v_d in v from the independent ones, v_i, by the factors in w.
 
-    They solve G_d v_d = -(C_t, b) - G_i v_i, eq. (14) of the paper. G_d and G_i are the dependent and independent
+    v_d solves G_d v_d = -(C_t, b) - G_i v_i, eq. (14) of the paper. G_d and G_i are the dependent and independent
     columns of [C_q; A]; A v + b = 0 are the non-holonomic constraints. If a velocity changes by more than
     `reuse_limit`, set w.has_gamma to 0: w.Gamma from the callback `kinematics` is no longer valid.
     """

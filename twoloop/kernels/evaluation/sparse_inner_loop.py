@@ -1,7 +1,7 @@
 """Do the tasks of the inner loop for large systems, by sparse factors in an order of elimination that is chosen once.
 
 There is no partition: steps integrate all coordinates, and the stages need not satisfy the constraints. Where other
-forms compute dependent coordinates, this one moves all coordinates to the nearest state on the constraints, in the
+forms compute dependent coordinates, this form moves all coordinates to the nearest state on the constraints, in the
 metric of M. If sparse factors do not show which rows are independent, a task returns NEEDS_DENSE, and the run continues
 with the forms of linalg/saddle_point.py, which methods with a partition always use. Callbacks may return the nonzero
 entries of C_q; then no array has n_c times n_q numbers. They may also fill dense matrices; then entries are copied.
@@ -65,7 +65,7 @@ from twoloop.kernels.linalg.symbolic_factorization import (
     pivot_order_of,
 )
 
-# pivot / (squared norm of a row of C_q) is the squared sine of its angle to the span of previous rows, in metric M^-1
+# pivot / (squared norm of a row of C_q) is sin^2 of the angle of this row to the span of previous rows, metric M^-1
 SUSPECT_PIVOT = 1e-6  # up to this squared sine of a row's angle, a pivot may be a rounding error: the row is checked
 MIN_PIVOT = 1e-10  # factors are accurate if pivot / (squared norm of the row) exceeds this for all independent rows
 MAX_DEPENDENT_SINE = 1e-11  # a row is redundant if the sine of its angle to the independent rows' span is at most this
@@ -231,7 +231,7 @@ def _choose_rows(f, w, t, q):
 
 @compiled
 def _adopt_rows(w):
-    """Store the indices of the independent rows in w.rows_v; return DONE, or SINGULAR if their number has changed."""
+    """Store the indices of the independent rows in w.rows_v; return DONE, or SINGULAR if the number of rows changes."""
     if _count_independent(w.is_independent) != w.rows_v.size:
         return SINGULAR
     position = 0

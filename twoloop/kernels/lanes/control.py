@@ -30,7 +30,7 @@ JUMP_RATIO, FIRST, LEAST, N_HEAD = range(N_RULE, N_RULE + 4)
 
 SUDDEN_ERROR = 10.0  # a rejected step with a larger error, in tolerances, is assumed to contain a jump of a force
 MAX_RATIO_AFTER_REJECTION = 0.95  # largest ratio of the next step size to a rejected step size
-# if a step would end before t1 by at most this fraction of the time left, it is lengthened to end at t1
+# if a step would end before t1 by at most this fraction of the time left, the step is lengthened to end at t1
 END_ROUNDING = 1e-10
 # if a step of size h fails because its stages or its end cannot be computed, step sizes are limited to LIMIT_FACTOR * h
 # until more than LIMIT_MEMORY steps have been accepted. The values equal those of the class `Plan`

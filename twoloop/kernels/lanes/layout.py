@@ -37,9 +37,9 @@ LANES = 8 if has_wide_vectors() else 4  # number of runs at once: the number of 
     UNIT,  # unit of time in which a Taylor series is computed (s)
     H,  # size of the step (s)
     X,  # time (s) from the beginning of the step to NEW; during tasks of a Taylor series, in units of UNIT
-    ACTIVE,  # 1 in lanes where the next task has to run; a task that fails in a lane sets 0 there
+    ACTIVE,  # 1 in lanes where the next task has to run; a task that fails in a lane stores 0 for this lane
     DEFECT,  # defect at the end of the step, relative to the allowed defect
-    PREDICTION_ERROR,  # difference of predicted and projected positions, relative to its limit, see step_size.py
+    PREDICTION_ERROR,  # difference of predicted and projected positions / its allowed value, see control/step_size.py
     LENGTH,  # step size that the last terms of a Taylor series allow, in units of UNIT
     LONGEST,  # largest step size (s) that a Taylor method allows after the last step
     REQUESTED,  # 1 in lanes that begin a run, or whose state at an output time within the step is computed
@@ -60,13 +60,13 @@ LANES = 8 if has_wide_vectors() else 4  # number of runs at once: the number of 
     JUMP_END,  # time (s) at the end of the last step that was rejected with an error above SUDDEN_ERROR
     SHIFT,  # number from 0 to 1 that shifts the times of evaluations of the defect within a step
     EVALUATED,  # number of evaluations within the step, in addition to settings[N_EVALUATIONS]
-    DISPLACED,  # size that smaller coordinates count as, when finite differences displace them, see `typical_size`
+    DISPLACED,  # least size of q (or v) to which displacements in finite differences are relative, see `typical_size`
     PAST,  # size and error of the last accepted step, for step-size control: both of lane 0, then both of lane 1, ...
     _MORE_PAST,
     N_FIELDS,
 ) = range(32)
 # names of functions that are generated for each mechanism; methods of the same names, such as `commit` in
-# generate/lane_code.py, write them. Arguments: order of the Taylor series, settings `control`, memory `work`
+# generate/lane_code.py, write the code. Arguments: order of the Taylor series, settings `control`, memory `work`
 TASKS = ("correct_positions", "correct_state", "check_redundant_rows", "compute_prediction_error", "commit")
 TASKS_OF_STARTS, TASKS_OF_STAGES, TASKS_OF_EXPLICIT = ("compute_rows",), ("compute_accelerations",), ("compute_stages",)
 TASKS_OF_SERIES = (
@@ -76,9 +76,9 @@ TASKS_OF_SERIES = (
 CODE = Reference("LaneKit", {})  # type of objects of the class LaneKit in compiled code
 ALL_TASKS = (*TASKS, *TASKS_OF_STARTS, *TASKS_OF_STAGES, *TASKS_OF_EXPLICIT, *TASKS_OF_SERIES)
 CODE.add_llvm_functions(dict.fromkeys(ALL_TASKS, types.none(types.int64, VECTOR, VECTOR)))
-# signature of a method's step (code, settings, control, options, work, status, n_steps, within). In lanes with a run it
-# takes a step, sets ACCEPTED, and stores the final state in NEW, accelerations in A, multipliers in LAM. If `within`,
-# it takes no step: NEW becomes the state X s after the beginning of the last accepted step, not projected
+# signature of a method's step (code, settings, control, options, work, status, n_steps, within). In lanes with a run,
+# the function takes a step, sets ACCEPTED, and stores the final state in NEW, accelerations in A, multipliers in LAM.
+# If `within`, no step is taken: NEW becomes the state X s after the beginning of the last accepted step, not projected
 STEP = types.void(CODE, INTEGERS, *[VECTOR] * 3, *[INTEGERS] * 2, types.boolean)
 CODE.add_function("step", STEP)
 
@@ -119,7 +119,7 @@ def _type_of_kit(value: Any, context: Any) -> Any:
 
 
 def array_offsets(n, n_rows, n_numbers):
-    """Return the offsets in `work`, in vectors, of the arrays that follow its fields.
+    """Return the offsets in `work`, in vectors, of the arrays that follow the fields T, T_NEW, ...
 
     The arrays are STATE and NEW (q, v); PREDICTED (q before a projection); SERIES_A (accelerations by a Taylor series);
     A (accelerations) and LAM (multipliers); the data of the generated code (n_numbers); the memory of the method.
@@ -194,7 +194,7 @@ def _raised_value(work, target, error, factor, before, after, atol, rtol):
 
 @compiled
 def raise_to_ratio(work, target, error, factor, before, after, atol, rtol):
-    """In each lane, raise the number at `target` to the ratio of an error to its tolerance, if this is larger.
+    """In each lane, raise the number at `target` to the ratio of an error to its tolerance, if the ratio is larger.
 
     The ratio is |error| * factor / (atol + rtol * max(|before|, |after|)); all names but atol and rtol are offsets.
     """

@@ -104,7 +104,7 @@ def block_offset(memory, n, s, block):
 
 @merged
 def _weights_offset(memory, n, s):
-    """Return the offset of the weights (s, s): `predict_stages` multiplies the block PREVIOUS by them."""
+    """Return the offset of the weights (s, s): `predict_stages` multiplies the block PREVIOUS by these."""
     return memory + N_SINGLE_VECTORS + (N_VECTORS + N_BLOCKS * s) * n
 
 
@@ -124,7 +124,7 @@ def pivots_offset(memory, n, s, n_systems, k):
 def _evaluate_middle_state(code, settings, control, c, work, new, a, memory):
     """Store in MIDDLE_Q, MIDDLE_V and MIDDLE_A a state in the middle of the step, and its accelerations.
 
-    The state is extrapolated from the beginning of the step. One correction moves its positions to the constraints.
+    The state is extrapolated from the beginning of the step. One correction moves the positions to the constraints.
     """
     n, order = settings[at.N], settings[at.ORDER]
     node, begin = middle_node(c), vector_offset(memory, n, BEGIN_Q)
@@ -418,7 +418,7 @@ def store_state_from_stages(settings, b, bA, work):
 
 @merged
 def _allowed_error(control, work, state, new, j, entry, k):
-    """Return atol + rtol * (largest |value| before or after the step) for an entry of the state; j: its coordinate."""
+    """Return atol + rtol * (largest |value| before or after the step) for an entry of the state, of coordinate j."""
     magnitude = max(abs(work[(state + entry) * LANES + k]), abs(work[(new + entry) * LANES + k]))
     return control[at.ATOL + j] + control[at.RTOL] * magnitude
 

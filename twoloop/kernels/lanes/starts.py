@@ -55,7 +55,7 @@ def subtract_products(work, target, x, x_stride, y, y_stride, count):
 def subtract_row_product(work, target, entries, pattern, i, y):
     """In each lane, subtract the dot product of row i of a sparse matrix and the vector at offset y from `target`.
 
-    `entries`: offset of the nonzero entries, row by row; their columns in row i are pattern[pattern[i]:pattern[i + 1]].
+    `entries`: offset of the nonzero entries, row by row; pattern[pattern[i]:pattern[i + 1]] are the columns of row i.
     """
     for e in range(pattern[i], pattern[i + 1]):
         subtract_products(work, target, entries + e - pattern[0], 1, y + pattern[e], 1, 1)
@@ -215,20 +215,20 @@ ROUNDING_FACTOR = 64.0  # a constraint holds if its residual is at most this num
 MAX_CURVATURE = 0.25
 MIN_EIGENVALUE = 1e-12  # constraints are independent if all eigenvalues of G G^T exceed this (rows of G have norm 1)
 N_WEAKEST_ITERATIONS = 10  # number of inverse iterations for the direction that the constraints determine least
-N_REDUNDANT = 5  # index of the number of redundant rows in `settings`; in this module, it replaces N_EVALUATIONS
-# factors (x, y) of three other guesses, p + x (p - p_0) + y d, where p_0 is the first guess, p its projection onto the
-# constraints, and d the direction that the constraints determine least
+N_REDUNDANT = 5  # index of the number of redundant rows in `settings`, where other kernels have N_EVALUATIONS
+# factors (x, y) of three other guesses, p + x (p - p_0) + y d. p_0 is the first guess; p is p_0 projected onto the
+# constraints; d is the direction that the constraints determine least
 OTHER_GUESSES = ((-2.0, 0.0), (0.0, 1.0), (0.0, -1.0))
 
 
 def offsets_in_memory(memory, n, n_rows, n_entries, n_redundant):
     """Return the offsets (in vectors) of the arrays in the method's memory, which begins at `memory`, and of its end.
 
-    It begins with C and C_t (n_rows each) and the entries of G = C_q, which the generated code writes. Then follow
+    The memory begins with C and C_t (n_rows each) and the entries of G = C_q, which generated code writes. Then follow
 
     - x (n_rows), a right-hand side
     - change (n), of positions or velocities
-    - nearest_positions (n), the guess projected onto the constraints; change_from_guess (n), from the guess to these
+    - nearest_positions (n), the guess projected onto the constraints; change_from_guess (n), nearest_positions - guess
     - weakest_direction (n), the direction that the rows of G determine least
     - displacement (n), of another guess from `nearest_positions`
     - row (n), a row of G

@@ -4,8 +4,8 @@ In LAPACK's band storage, entry (i, j) of a matrix is entry [j, top + i - j] of 
 triangle of the mass matrix M, top is the bandwidth b. For an LU, top is 2 b: row exchanges fill b more diagonals.
 
 The LAPACK library comes with SciPy. Kernels are stored on disk, but addresses of LAPACK routines differ from process to
-process, and must not be part of compiled code. So a run stores `lapack_addresses` in its workspace `w`, and passes one
-of them to `call_lapack`. (Numba calls LAPACK only for dense matrices, and allocates memory.) `f` is the kit.
+process, and must not be part of compiled code. So a run stores `lapack_addresses` in the workspace `w`, and passes an
+address to `call_lapack`. (Numba calls LAPACK only for dense matrices, and allocates memory.) `f` is the kit.
 """
 
 import numpy as np
