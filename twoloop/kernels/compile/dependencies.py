@@ -345,7 +345,7 @@ class FunctionCopier:
         self.copies: dict[Any, Any] = {}  # replacements, by id of the original
 
     def replacement_of(self, value: Any, names: frozenset[str] = frozenset()) -> Any:
-        """Return the replacement of a helper, a tuple, or a user's module (only of attributes `names`); else `value`."""
+        """Return the replacement of a helper, a tuple, or a user's module (attributes `names` only); else `value`."""
         if self.is_copied(value):
             if id(value) not in self.copies:
                 self._add_copy(value)

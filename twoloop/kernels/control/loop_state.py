@@ -19,7 +19,7 @@ from numpy.typing import NDArray
     ROWS_VIOLATED,  # constraints that counted as redundant are violated at the end of a step
     NEAR_SINGULAR,  # a singular position is near: the caller crosses it by special steps
     SWITCH_METHOD,  # the method does not suit the motion: the caller continues with another method
-    AT_DISCONTINUITY,  # constraint rate C_t or b jumps just after clock[T]: the caller computes the state after the jump
+    AT_DISCONTINUITY,  # a constraint rate jumps just after clock[T]: the caller computes the state after the jump
     NEEDS_DENSE,  # the fixed-order form cannot decide which rows are independent: the caller uses a dense form
     NEEDS_COMPILATION,  # the step has no machine code yet: the caller compiles it, then calls `advance` again
 ) = range(12)
