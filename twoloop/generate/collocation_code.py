@@ -1,10 +1,10 @@
 """Generate code for collocation steps whose stages are evaluated side by side, one in each SIMD lane.
 
 A fixed-point iteration solves for the stages of an implicit Runge-Kutta step. Each sweep (one iteration) evaluates the
-accelerations of all stages at once, one in each lane, and integrates them: this takes little longer than one
-evaluation. Usually the accelerations depend on some of the coordinates only: only these are iterated, and the others
+accelerations of all stages at once, one in each lane, and integrates them: a sweep takes little longer than one
+evaluation. Usually the accelerations depend on some of the coordinates only. Only these are iterated; the others
 follow from the final accelerations. The ends of eight steps are projected onto the constraints at once, too.
-kernels/steps/lobatto_step.py calls the generated functions. They share an array `work`: see kernels/data/collocation.py
+kernels/steps/lobatto_step.py calls the generated functions, which share an array `work` (kernels/data/collocation.py).
 
 The method is Lobatto IIIA with nine nodes, the first of which is the end of the previous step; its order is 16. The
 polynomial of degree 8 through the accelerations at the nodes is expanded in Legendre polynomials, whose integrals and
@@ -77,8 +77,8 @@ def tables() -> Tables:
     values = _legendre(x)
     weights = 2 / (N * (N - 1) * values[N - 1] ** 2)
     norms = np.array([np.longdouble(2) / (2 * k + 1) for k in range(N)])
-    norms[N - 1] = np.longdouble(2) / (N - 1)  # the sum over the nodes for the integral of P_8^2, which is 2 / 17
-    coefficients = values[:N] * weights / norms[:, None]  # [k, j]: coefficient of P_k in Lagrange polynomial j
+    norms[N - 1] = np.longdouble(2) / (N - 1)  # what the quadrature rule yields for the integral of P_8^2 (2 / 17)
+    coefficients = values[:N] * weights / norms[:, None]  # [k, j]: Legendre coefficient k of Lagrange polynomial j
     powers = [
         np.array([[sign ** (n + k) * comb(n, k) * comb(n + k, k) for n in range(N)] for k in range(1, N)]).T
         for sign in (-1, 1)
@@ -94,7 +94,7 @@ def tables() -> Tables:
 
 
 def _nodes() -> Extended:
-    """Return the nodes on [-1, 1]: -1, the zeros of the derivative of the Legendre polynomial P_8, and 1."""
+    """Return the nodes, scaled to [-1, 1]: -1, 1, and the zeros of the derivative of the Legendre polynomial P_8."""
     zeros = legendre.legroots(legendre.legder([0] * (N - 1) + [1])).astype(np.longdouble)
     derivative = legendre.legder(np.array([0] * (N - 1) + [1], dtype=np.longdouble))
     for _ in range(3):
@@ -162,7 +162,7 @@ class CollocationCode:
     Fields:
     iterated_coordinates : coordinates on whose positions or velocities the accelerations depend.
     numbers : coefficients of the equations, with their indices in the array from which the functions read them.
-    structure : digest of all that determines the functions, except values of `numbers`: the key of cached functions.
+    structure : key of cached functions, a digest of all that determines the functions except values of `numbers`.
     """
 
     def __init__(self, shared: SharedCode):
@@ -185,7 +185,7 @@ class CollocationCode:
 
         if self.split_functions is None:
             programs = [*self.equations.accelerations, self.equations.position_projection, self.equations.projection]
-        else:  # equations are split into several functions: `shared.digest` below covers all programs but this one
+        else:  # equations are split into functions: `shared.digest` below covers all programs except this first one
             programs = self.equations.accelerations[:1]
         numbers = self.numbers
         description = [[each.sizes, *numbers.structure(each)] for each in programs]
@@ -256,7 +256,7 @@ class CollocationCode:
         return self._iterate(emit, work, state, tolerances, evaluate, fallback)
 
     def _mass_first_function(self, emit: LaneEmitter, kinds: list[str]) -> str:
-        """Return the name of an LLVM function that does `iterate_step` by the elimination that begins with M only."""
+        """Return the name of an LLVM function for `iterate_step` that uses only the elimination beginning with M."""
         module, name = emit.builder.module, "careful_nodes"
         if not module.defines(name):
             builder = module.function(name, DOUBLE, kinds, internal=True)
@@ -271,7 +271,7 @@ class CollocationCode:
     def _evaluator(
         self, emit: LaneEmitter, work: Value, state: Value, index: int
     ) -> Callable[[list[Value]], Callable[[], Value]]:
-        """Return `evaluate` for `_iterate`: it writes calls of a function that runs `accelerations[index]`."""
+        """Return a function `evaluate` for `_iterate`, which writes calls of the program `accelerations[index]`."""
         accelerations = Emitter(emit.builder).pointer(work, self.a_offset)
 
         def evaluate(inputs: list[Value]) -> Callable[[], Value]:
@@ -449,8 +449,8 @@ class CollocationCode:
     def _repeated(self, emit: LaneEmitter, work: Value, state: Value) -> Iterator[list[Value]]:
         """Return a context manager: code written in its block runs once in a sweep, or twice if the field REPEATS is 1.
 
-        The code computes accelerations from the velocities that the context manager yields: in the first pass, those of
-        the last sweep; in the second, integrals of accelerations of the first pass, to converge faster.
+        The code computes accelerations from velocities that the context manager yields: in the first pass, velocities
+        of the last sweep; in the second, integrals of the first pass's accelerations, so that sweeps converge faster.
         """
         builder, num, first_offset = emit.builder, Emitter(emit.builder), integer(self.v_offset)
         before, loop, repeat, after = builder.block, *(builder.append_block() for _ in range(3))
@@ -479,7 +479,7 @@ class CollocationCode:
         return values
 
     def _estimate_error(self, emit: LaneEmitter, work: Value, state: Value) -> None:
-        """Write code that estimates the error of a step whose stages have converged, and what size the next may have.
+        """Write code that estimates the error of a step whose stages have converged, and the size of the next step.
 
         The code stores ERROR, CURVATURE, FACTOR and FACTOR_OF_ERROR (data/collocation.py). ERROR extrapolates the decay
         of the Legendre coefficients of the accelerations. Let m_k be the largest magnitude of the coefficients of
@@ -573,7 +573,7 @@ class CollocationCode:
     def end_step(self, emit: LaneEmitter, work: Value, state: Value, new_state: Value) -> None:
         """Write code that stores [q, v, a] at the end of the step in `new_state`.
 
-        The code also stores the polynomial of the accelerations that will predict the next step, and NEXT_DEGREE.
+        The code also stores the polynomial of the accelerations, for the next prediction, and its degree NEXT_DEGREE.
         """
         builder, num, n = emit.builder, Emitter(emit.builder), self.n
         last, h = LANES - 1, num.load(work, mem.H)
@@ -665,7 +665,7 @@ class CollocationCode:
     def _project_in_parts(
         self, emit: LaneEmitter, work: Value, numbers: Value, write: Callable[..., Value], names: tuple[str, ...]
     ) -> None:
-        """Write code as `_project` does, but by `write`, which writes calls of functions for parts of the equations."""
+        """Do the same as `_project` for equations that are split into functions; `write` writes calls of these."""
         num, moved = Emitter(emit.builder), emit.builder.allocate(DOUBLE, LANES * self.n)
         indices = {name: num.pointer(work, index) for name, index in self._end_offsets().items()} | {"moved": moved}
         state = load_lanes(emit, work, self.end_offset), indices["q"], indices["v"]

@@ -39,7 +39,7 @@ DOUBLE_POINTER = f"{DOUBLE}*"
 # generated code is not used if the relative error of its accelerations near the start is larger. This is checked only
 # if rows of G are added to M, or solutions are refined (see PivotChoice). During runs, the error grew up to 200 times
 LARGEST_LOSS = 1e-8
-MAX_POSITIONS, SPACING = 4, 0.02  # this error is measured at the first of 4 positions, 0.02 apart, with large pivots
+MAX_POSITIONS, SPACING = 4, 0.02  # number and spacing (m or rad) of positions; the first with large pivots is used
 
 
 def write_accelerations(
@@ -140,7 +140,7 @@ def _accelerations(
 
 
 def _acceleration_function(emit: Emitter, equations: Elimination, index: int, numbers: Coefficients) -> str:
-    """Return the name of the LLVM function for `equations.accelerations[index]`; if it is missing, write it."""
+    """Return the name of the LLVM function for `equations.accelerations[index]`; write the function if necessary."""
     program, is_mass_first = equations.accelerations[index], index in (-1, len(equations.accelerations) - 1)
     module, name = emit.builder.module, f"{'mass_first' if is_mass_first else 'quick'}_{emit.suffix}"
     if not module.defines(name):
@@ -164,7 +164,7 @@ def _acceleration_function(emit: Emitter, equations: Elimination, index: int, nu
 
 
 def _coefficient_pointers(emit: Emitter) -> list[Value]:
-    """Return one pointer to all coefficients; or, in SIMD lanes, two: to those that vary between lanes, and others."""
+    """Return a pointer to all coefficients; in SIMD lanes, pointers to those that vary between lanes, and to others."""
     constants = getattr(emit, "constants", None)
     return [emit.numbers] if constants is None else [emit.numbers, constants]
 
@@ -209,7 +209,7 @@ class SplitFunctions:
             self._part_writers[name] = partial(self._write_part, program, {})
 
     def structure(self) -> Iterable[Any]:
-        """Yield all that determines the code of the functions: its digest is the key of cached code."""
+        """Yield all data that determine the code of the functions; their digest is the key of cached code."""
         solution, numbers = self.solution, self.numbers
         yield solution.factor_program.sizes, list(numbers.structure(solution.factor_program))
         for program in self.position_programs.values():
@@ -228,7 +228,7 @@ class SplitFunctions:
         return list(functions)
 
     def _call(self, emit: Emitter, *calls: tuple[str, Sequence[Value]]) -> Value:
-        """Write calls of parts, given as (name, arguments), and missing parts; return a flag: 1 if all are valid."""
+        """Write calls (part, arguments), and the parts that the module lacks; return a flag: 1 if results are valid."""
         module, all_valid = emit.builder.module, None
         for part, arguments in calls:
             name = f"{part}_{emit.suffix}"
@@ -250,7 +250,7 @@ class SplitFunctions:
         return lowering
 
     def _write_factors(self, emit: Emitter, *arguments: Value) -> Value:
-        """Write the part "factors", which stores factors in `arguments[4]`; return a flag: 1 if pivots are large."""
+        """Write the part "factors", which fills the array `arguments[4]`; return a flag: 1 if pivots are not small."""
         graph, solution, stored = self.equations.graph, self.solution, arguments[4]
         lowering = self._lowering(emit, graph, arguments, {})
         locations = {i: (stored, index) for i, index in solution.stored_indices.items()}
@@ -263,7 +263,7 @@ class SplitFunctions:
     def _write_part(self, program: Program, stored: Mapping[int, int], emit: Emitter, *arguments: Value) -> Value:
         """Write a part that runs `program`; return a flag: 1 if its results are valid.
 
-        The part loads the quantities in `stored` instead of computing them; values: indices in `arguments[4]`.
+        The part loads the quantities in `stored` from the array `arguments[4]`; values of `stored`: their indices.
         """
         locations = {i: (arguments[4], index) for i, index in stored.items()}
         lowering = self._lowering(emit, program.graph, arguments, locations)
@@ -343,7 +343,7 @@ class SplitFunctions:
         return is_valid
 
     def _stack_arrays(self, emit: Emitter) -> list[Value]:
-        """Return pointers to four arrays: of stored quantities; r and c (right-hand sides); changes of v, or lam."""
+        """Return pointers to four arrays, for stored quantities, right-hand sides r and c, and a change of v or lam."""
         sizes = self.solution.n_stored, self.n, self.n_rows, max(self.n, self.n_rows)
         return [_stack_array(emit, size) for size in sizes]
 
@@ -394,7 +394,7 @@ class SharedCode:
     """Compiled functions for the equations of systems that differ only in parameters, cached on disk.
 
     numbers : coefficients of the equations, with their indices in the array from which the functions read them.
-    digest : digest of all that determines the functions, except values of `numbers`: the key of cached functions.
+    digest : key of cached functions, a digest of all that determines the functions except values of `numbers`.
     """
 
     def __init__(self, equations: Elimination, cache: TraceCache):
@@ -446,11 +446,11 @@ class GeneratedCode(NamedTuple):
     shared: SharedCode
     numbers: Array  # values of the coefficients that the code reads
     traced: CallbackTraces
-    evaluate: Evaluator  # computes expressions in the parameters with the values that they have in this system
+    evaluate: Evaluator  # computes expressions in the parameters, with the parameters of this system
 
     @property
     def kinds(self) -> frozenset[str]:
-        """Return the kinds of callbacks that were traced."""
+        """Return the names of the callbacks that were traced, such as "mass"."""
         return self.traced.kinds
 
     def is_valid_from(self, system: ConstrainedSystem, t0: float, q0: Array) -> bool:

@@ -20,7 +20,7 @@ from twoloop.generate.trace import GAMMA_SOURCES, Equations, Evaluator, TraceCac
 from twoloop.generate.traced_values import CallbackTraces, Check, accept_traces
 from twoloop.problem.system import ConstrainedSystem
 
-# keys: callbacks that are derived if the user does not give them; values: attribute of a system with their size
+# keys: callbacks that are derived if the user does not give them; values: the system's attribute for their size
 DERIVABLE_CALLBACKS = {"jacobian": "n_c", "gamma": "n_c", "nonholonomic_gamma": "n_a"}
 
 
@@ -87,7 +87,7 @@ def _derive_programs(system: ConstrainedSystem, missing: Sequence[str], cache: T
 
 
 def _missing_derivatives(equations: Equations, missing: Sequence[str]) -> dict[str, dict[int, Affine]]:
-    """Return expressions by index: "gamma" (rows of C, then of A), and "jacobian" (nonzero entries of flat C_q)."""
+    """Return {index: expression} for "gamma" (rows of C, then of A) and "jacobian" (nonzero entries of flat C_q)."""
     system = equations.system
     gamma: dict[int, Affine] = {}
     for kind, first in (("gamma", 0), ("nonholonomic_gamma", system.n_c)):
@@ -102,8 +102,8 @@ def _missing_derivatives(equations: Equations, missing: Sequence[str]) -> dict[s
 Array = NDArray[np.float64]
 
 MAX_ENTRIES = 50_000  # callbacks are not compared with exact derivatives if G = [C_q; A] has more entries
-# callbacks and exact derivatives are compared at the start, and at states displaced from the start: coordinates by
-# these multiples of their sizes, the time by these multiples of FIRST_TIME_SCALE
+# callbacks and exact derivatives are compared at states displaced from the start: each coordinate by these multiples of
+# its typical magnitude, the time by these multiples of FIRST_TIME_SCALE
 DISPLACEMENTS = (0.0, 1e-3, 0.03)
 
 

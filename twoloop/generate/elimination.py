@@ -61,7 +61,7 @@ START_LIMITS = MIN_PIVOTS[:-1] / PIVOT_FRACTION
 # longer, and i must be at least MIN_INDEX_MANY, or MIN_INDEX_MANY + 1 if M is singular
 N_FEW_COORDINATES = 24
 MIN_INDEX_FEW, MIN_INDEX_FEW_SINGULAR, MIN_INDEX_MANY = 4, 5, 6
-ADDED_SIZE = 16.0  # if s G^T G is added to M, its largest entry is about this many times the largest entry of M
+ADDED_SIZE = 16.0  # the scale s is chosen so that the largest entry of s G^T G is about this * that of M
 MAX_PIVOT_RATIO = 1e5  # solutions are refined if a diagonal entry of M with added rows is above this * the row's pivot
 SCALE_STEP = 1024.0  # scales of rows added to M differ by powers of this number, so large that most starts share code
 DISPLACEMENT = 0.2  # displacement of coordinates (m or rad) to a position where no entry of M and G is zero by chance
@@ -369,7 +369,7 @@ class Elimination:
         return matrix
 
     def _solve(self, r: Sequence[Affine], c: Sequence[Affine]) -> tuple[list[Affine], list[tuple[Affine, Affine]]]:
-        """Return the solution [a, lam] of M a + G^T lam = r, G a = c (c: for all rows of G), and its conditions."""
+        """Return [a, lam] that solve M a + G^T lam = r, G a = c (c: for all rows), and conditions of validity."""
         return solve_refined(self.factors.solve, self.choice, self.mass, self.all_rows, r, c)
 
     def _right_sides(self, v: Sequence[Affine]) -> tuple[list[Affine], list[Affine]]:

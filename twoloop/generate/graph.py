@@ -48,7 +48,7 @@ class Graph(SymbolicObject):
     operations : for each quantity, None if it is an input, else (kind of operation, first argument, second argument or
         None). The second argument of a logarithm or an arctangent is the divisor in its derivative.
     input_sizes : number of inputs that each call of `inputs` has added.
-    traced : results of traced callbacks: arrays of expressions by kind of callback.
+    traced : results of traced callbacks, as arrays of expressions; keys: names of callbacks, such as "mass".
     """
 
     def __init__(self) -> None:

@@ -56,7 +56,7 @@ FIRST_UNIT = 0.01  # unit of time of the first series of a run, relative to the 
 # a projection has converged if it changes q by at most ABSOLUTE_CORRECTION (unit of q) or RELATIVE_CORRECTION * max|q|
 ABSOLUTE_CORRECTION, RELATIVE_CORRECTION = 1e-14, 1e-14
 CONTRACTION = 0.5  # a projection fails if the ratio of a correction to the previous correction is above this
-N_PARALLEL = 3  # number of coordinates whose series one loop evaluates: each needs 3 of the 16 vector registers
+N_PARALLEL = 3  # number of coordinates whose series one loop evaluates: a coordinate needs 3 of 16 vector registers
 
 
 class LaneMemory(NamedTuple):
@@ -67,7 +67,7 @@ class LaneMemory(NamedTuple):
     state: Value
     new: Value
     predicted: Value
-    series_a: Value  # accelerations by the Taylor series: its second derivative
+    series_a: Value  # accelerations by the second derivative of the Taylor series
     a: Value  # accelerations by the equations of motion
     lam: Value
     series: Value
@@ -137,7 +137,7 @@ class LaneSteps:
             store_mask(emit, work, field, is_continued)
 
     def evaluate_series(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Write code that stores NEW, the state by the series at the end of the step, and its positions `predicted`."""
+        """Write code that evaluates the series at the end of the step, and stores q, v in NEW and q in `predicted`."""
         memory = self.memory(emit, order, control, work)
         for j, q in enumerate(self.evaluate_positions(emit, memory, emit.load(work, lanes.X))):
             emit.store(q, memory.predicted, j)
@@ -181,7 +181,7 @@ class LaneSteps:
         """
         n, (rtol, atol) = self.n, self.tolerances(emit, control)
         order, h = emit.to_double(memory.order), emit.load(memory.work, lanes.H)
-        # if h is 0, per_duration is infinite: the tolerances of positions then allow any defect
+        # if the step size h is 0, per_duration is infinite: then the tolerances of positions allow any defect
         duration, per_duration = h / order, order / h
         largest = max_defect = emit.constant(0.0)
         for each in a:
@@ -226,7 +226,7 @@ class LaneSteps:
         return None
 
     def accept_or_reject(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Write code that accepts steps (ACCEPTED = 1) or rejects them, and limits the next step size to LONGEST.
+        """Write code that accepts or rejects steps (ACCEPTED = 1 or 0); LONGEST becomes the limit of the next size.
 
         After too many rejections or a value that is not finite, a run leaves its lane: RUNNING = 0.
         """
@@ -375,7 +375,7 @@ class LaneStages:
         return [np.asarray(each).tobytes() for each in self.tableau]
 
     def write(self, emit: LaneEmitter, arguments: tuple[Value, Value, Value], memory: LaneMemory) -> None:
-        """Write code that stores NEW, the state X (s) after the step began; ERROR is valid if X is the step size H."""
+        """Write code that stores NEW, the state at the time X (s) in the step; ERROR is valid if X is the step size."""
         A, b, c, fine_weights, coarse_weights = self.tableau
         _, control, work = arguments
         x, t = emit.load(work, lanes.X), emit.load(work, lanes.T)
@@ -423,12 +423,12 @@ class _Coordinate:
         self.old_state = tuple(emit.load(series_pointer, lanes.BEGIN * n + index) for index in (0, n))
         self._acceleration_locations = [(series_pointer, (lanes.SLOPES + k) * n) for k in range(count)]
         self._loaded: dict[int, Value] = {}
-        if count > 1:  # the acceleration of the last stage is new: move it from `a` to those of all stages
+        if count > 1:  # the acceleration of the last stage is still in `a`: store it with those of earlier stages
             self._loaded[count - 1] = emit.load(emit.pointer(memory.a, j))
             emit.store(self._loaded[count - 1], *self._acceleration_locations[count - 1])
 
     def sum(self, weights: Array) -> Value:
-        """Return the sum of the accelerations at all stages, multiplied by weights."""
+        """Return the weighted sum of the accelerations of this coordinate at the stages."""
         total: Value | None = None
         for k, weight in enumerate(weights.tolist()):
             if abs(weight) > WEIGHT_ROUNDING:
@@ -445,7 +445,7 @@ class _Coordinate:
         return 1.0 / (atol + rtol * magnitude)
 
     def store_state(self, weights: Array, position_weights: Array, x: Value) -> tuple[Value, Value]:
-        """Write code that stores q and v of a stage in NEW; return both. Accelerations have `weights` in v."""
+        """Write code for q and v of a stage; accelerations have `weights` in v, and `position_weights` in q."""
         emit, (q, v) = self.emit, self.old_state
         drift = float(weights.sum()) * v
         q = q + x * (drift + x * self.sum(position_weights))
@@ -463,8 +463,8 @@ MAX_SERIES_OPERATIONS = 1500  # no code is generated for series with more operat
 class LaneCode(LaneSteps):
     """Generator of the code of one mechanism for SIMD lanes, including the step-size control.
 
-    series : True: generate code for Taylor steps, too.
-    tableau : Butcher tableau of an explicit Runge-Kutta method: generate code for its stages. None: no such code.
+    series : whether to generate code for Taylor steps.
+    tableau : Butcher tableau of an explicit Runge-Kutta method, for whose stages code is generated; None: no such code.
     Raise Untraceable if the equations, or their series, cannot be generated; the message says why.
     """
 
@@ -526,7 +526,7 @@ class LaneCode(LaneSteps):
         return hashlib.sha256(repr(description).encode()).hexdigest()
 
     def compute_series(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Write code that stores the Taylor coefficients of q(t) in each lane, from STATE on; unit of time: UNIT."""
+        """Write code that stores the Taylor coefficients of q(t) about the state STATE, with UNIT as unit of time."""
         builder, n, memory = emit.builder, self.n, self.memory(emit, order, control, work)
         unit, out, scratch = self.update_unit(emit, control, work), memory.series, memory.scratch
         inputs = [emit.load(work, lanes.T), *(emit.load(memory.state, i) for i in range(2 * n))]
@@ -579,7 +579,7 @@ class LaneCode(LaneSteps):
         emit.store(builder.select(is_last, t1, t + h), work, lanes.T_NEW)
 
     def correct_positions(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Write code for a Newton step of q in NEW where ACTIVE = 1; set ACTIVE = UNCONVERGED = 1 if valid, else 0."""
+        """Write code for a Newton step to C = 0 where ACTIVE = 1; set ACTIVE = UNCONVERGED = 1 if valid, else 0."""
         is_active, _ = self._project(
             emit, self.equations.position_projection, lanes.ACTIVE, self.memory(emit, order, control, work)
         )
@@ -630,7 +630,7 @@ class LaneCode(LaneSteps):
         return is_active, largest
 
     def compute_accelerations(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Write code that stores the accelerations at (T_NEW, NEW), and ACTIVE = 0 in lanes where they are invalid."""
+        """Write code that stores accelerations at (T_NEW, NEW), and sets ACTIVE = 0 in lanes where they are invalid."""
         memory = self.memory(emit, order, control, work)
         is_valid, a = self._accelerations(emit, work, memory)
         for k, value in enumerate(a):
@@ -642,7 +642,7 @@ class LaneCode(LaneSteps):
         return is_valid, a
 
     def crossing_mask(self, emit: LaneEmitter, memory: LaneMemory) -> Value | None:
-        """Return the mask of `orientation_change_mask`; None for Taylor steps, where defects show singularities."""
+        """Return `orientation_change_mask(...)`, or None for Taylor steps, whose defects show singular positions."""
         if self.recurrences is not None or len(self.equations.rows) == 0:
             return None
         ends_of_step = (lanes.T, memory.state), (lanes.T_NEW, memory.new)
@@ -677,8 +677,8 @@ class LaneConstraints(LaneSteps):
 
     system : a system without nonholonomic rows.
     Fields:
-    pattern : sparsity pattern of C_q in one array: for each row, the index in this array where its columns begin; then
-        the length of the array; then the columns of the entries, row by row.
+    pattern : sparsity pattern of C_q in one array. First, it has the index in this array at which the columns of each
+        row begin; then the length of the array; then the columns of the entries, row by row.
     Raise Untraceable if the constraints cannot be generated; the message says why.
     """
 

@@ -32,7 +32,7 @@ from twoloop.kernels.lanes.layout import LANES
 # [-1/2, 1/2], with an error of 1e-07; both were fitted by least squares. Step-size control needs no better accuracy
 LOG2_COEFFICIENTS = (-3.03460285, 6.089895763, -5.301709109, 3.249466561, -1.247962495, 0.2700374574, -0.02512320329)
 EXP2_COEFFICIENTS = (1.000000075, 0.6931472067, 0.2402210736, 0.05550327214, 0.009676037098, 0.001340043216)
-# to avoid overflow, `exponential` clips x to +-MAX_EXPONENT, and `logarithm` replaces x below MIN_ARGUMENT by it
+# to avoid overflow, `exponential` clips x to +-MAX_EXPONENT, and `logarithm` replaces smaller x by MIN_ARGUMENT
 MAX_EXPONENT, MIN_ARGUMENT = 1000.0, 1e-300
 
 
@@ -166,10 +166,10 @@ class Operation(NamedTuple):
 class LaneSeries:
     """Generator of code that computes the Taylor series of the motion, by the operations of a SeriesProgram.
 
-    `scratch` is an array of vectors. Its parts: the factored matrix of the linear equations M a + G^T lam = r and
-    G a = c for accelerations a and multipliers lam; r; the reciprocal divisors in recurrences of roots, logarithms and
-    arctangents; sums computed for the next order (see `_shared_sums`); a row of zeros; and, for each order, a row with
-    the coefficients of all factors of products.
+    `scratch` is an array of vectors with these parts: the factored matrix of M a + G^T lam = r, G a = c (equations for
+    accelerations a and multipliers lam); the vector r; reciprocals of the divisors in recurrences of roots, logarithms
+    and arctangents; sums that were computed for the next order (see `_shared_sums`); a row of zeros; and, for each
+    order, a row with the coefficients of all factors of products.
     """
 
     def __init__(
@@ -208,7 +208,7 @@ class LaneSeries:
         return [self.n, self.n_rows, self.early, self.late, self.rows, self.balance, self.factor_indices]
 
     def _expressions(self, sums: Sums, rows: Sequence[int]) -> list[tuple[Terms, float]]:
-        """Return (terms, constant) of each expression in `sums`; `rows`: numbers by which `sums.row` names them."""
+        """Return (terms, constant) of each expression in `sums`; `rows`: the expressions' numbers, as in `sums.row`."""
         more: dict[int, list[tuple[int, float]]] = {row: [] for row in rows}
         for row, i, c in zip(
             sums.row.tolist(), sums.further_column.tolist(), sums.further_coefficient.tolist(), strict=True
@@ -221,7 +221,7 @@ class LaneSeries:
         ]
 
     def _row_expressions(self, sums: Sums, indices: Any) -> list[tuple[int, tuple[Terms, float]]]:
-        """Return pairs (index of an equation, (terms, constant) of its expression); `indices`: of all equations."""
+        """Return a pair for each equation: its index, from `indices`; (terms, constant) of its expression in `sums`."""
         return list(zip(indices.tolist(), self._expressions(sums, indices.tolist()), strict=True))
 
     def _make_operations(self, table: OperationGroups, quantity: int) -> list[Operation]:
@@ -262,7 +262,7 @@ class LaneSeries:
         return {result: pair for result, pair in pair_of.items() if pair is not None}
 
     def _factors(self, operation: Operation) -> list[tuple[int, int]]:
-        """Return, for each result, the indices of factors X, Y: its recurrence contains the sum of X[j] Y[k - j]."""
+        """Return indices of factors X and Y for each result, whose recurrence contains the sum of X[j] Y[k - j]."""
         kind, results, first, second = operation
         if results[0] in self._carried_sums:
             return []
@@ -422,7 +422,7 @@ class LaneSeries:
     ) -> None:
         """Write code for coefficient k = `order` > 0 of the results of `operations`; `inverse`: 1 / k.
 
-        A PENDING product has a second factor whose coefficient k is unknown yet: the term with it is left out.
+        Coefficient k of the second factor of a PENDING product is not known yet: the term with it is left out.
         """
         pairs = list(dict.fromkeys(pair for operation in operations for pair in self._factors(operation)))
         sums = {}

@@ -186,7 +186,7 @@ class Emitter:
 
 
 class Quantities:
-    """Values of numbered quantities and of their linear combinations; each value is loaded or computed only once.
+    """Values of the quantities of a graph, and of linear combinations; each value is loaded or computed only once.
 
     If a function is split into parts, each part loads quantities again, because keeping them in registers or on the
     stack would take longer. So the memory from which quantities are loaded must not change.

@@ -73,7 +73,7 @@ class Factors:
     def _inverse(self, pivots: list[list[Affine]], own_pivots: list[Any]) -> list[list[Affine]]:
         """Return the inverse of a 1x1 or 2x2 pivot block, and append its pivots to `mass_pivots` or `conditions`.
 
-        `own_pivots`: for each row of the block, its pivot if G had no other rows; None: the row needs no condition.
+        `own_pivots`: for each row of the block, the pivot that it would have without the other rows; None: no condition.
         """
         diagonal = [None if pivot is None else pivot.as_term() for pivot in own_pivots]
         a = pivots[0][0]
@@ -139,7 +139,7 @@ def _collected_sum(products: Sequence[tuple[Affine, Affine]]) -> Any:
 
 
 def _pairs_without_conditions(rows: list[dict[int, Affine]], n: int) -> list[tuple[int, int]]:
-    """Return pairs (coordinate, row of G) that are eliminated first: their pivots need no condition and no division.
+    """Return pairs (coordinate, row of G) that are eliminated first, because their pivots are constant.
 
     The row of the coordinate in [M G^T; G 0] has only two entries, one in M and one in G^T, both constant. So the row
     of G in the pair is independent of the other rows of G.
@@ -237,7 +237,7 @@ class DependentCoordinates:
                 self._substitute(j, self._rows[i])
 
     def _eliminate(self, rows: tuple[int, ...], columns: tuple[int, ...]) -> None:
-        """Solve the equations `rows` of G a = gamma for a[columns]; insert the solution in the other equations."""
+        """Solve the equations `rows` of G a = gamma for a[columns]; insert the solution in the remaining equations."""
         self.check_length()
         block = [[self._rows[i].get(j, self._zero) for j in columns] for i in rows]
         pivot, inverse = self._inverse(block)

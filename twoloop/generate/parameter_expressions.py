@@ -69,7 +69,7 @@ class SymbolicObject:
 
     @contextmanager
     def running_callback(self) -> Iterator[None]:
-        """Context manager for a call of a callback; at its end, raise Untraceable if the callback caught a Refusal."""
+        """Context manager for a call of a callback: afterwards, raise Untraceable if the callback caught a Refusal."""
         self.is_tracing, self.refusal_reason = True, ""
         try:
             yield

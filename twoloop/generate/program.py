@@ -26,7 +26,7 @@ T = TypeVar("T")
 
 N_COMPARED = 5  # number of states at which a user's traced function is compared with calls of the function
 TIME_SPACING = 0.37  # time (s) between successive compared states; unlikely to be the period of a force
-MAX_TRACE_DIFFERENCE = 1e-10  # a trace is wrong if its relative difference from a call is larger than rounding errors
+MAX_TRACE_DIFFERENCE = 1e-10  # a trace is wrong if its relative difference from a call is above this: rounding is less
 
 # cost of operations by kind, in multiplications; the cost of other operations is not counted
 COSTS = {op.PRODUCT: 1, op.RECIPROCAL: 4}
@@ -35,7 +35,7 @@ COSTS = {op.PRODUCT: 1, op.RECIPROCAL: 4}
 class Algebra(Generic[T]):
     """Arithmetic in which a program runs; subclasses define the type T of values, and the operations on values.
 
-    functions : keys: codes of the operations with one argument, such as SINE; values: functions that compute them.
+    functions : functions that compute operations with one argument; keys: codes of the operations, such as SINE.
     values : values computed so far; keys: indices of quantities in the graph.
     """
 
@@ -81,7 +81,7 @@ class Algebra(Generic[T]):
 class Program:
     """Arrays to be computed from the inputs of a graph, and conditions under which these arrays are valid.
 
-    arrays : names of the arrays, and their entries: affine expressions.
+    arrays : lists of affine expressions, the entries of the arrays; keys: names of the arrays.
     conditions : pairs of expressions. The arrays are valid if in each pair the first is larger than the second.
     """
 
@@ -212,7 +212,7 @@ class OperationTable(NamedTuple):
         return [float(x) for part in parts for x in part]
 
     def as_arrays(self, result_indices: Sequence[int]) -> tuple[Any, Any]:
-        """Return integers and floats for a derived callback; `result_indices`: where in its output to store results."""
+        """Return the table as integers and floats; `result_indices`: where the derived callback stores results."""
         rows, n = self.rows.copy(), len(result_indices)
         rows[rows[:, KIND] == RESULT, NODE] += self.n_nodes
         header = [self.n_nodes + n, len(rows), len(self.columns), n]
@@ -304,7 +304,7 @@ class Coefficients:
     def structure(self, program: Program, stored: Mapping[int, int] = MappingProxyType({})) -> Iterable[Any]:
         """Yield all that the code for a program depends on, except values of coefficients: a key for cached code.
 
-        `stored`: keys: quantities that the code loads instead of computing them; values: their indices in memory.
+        `stored`: indices, in memory, of quantities that the code loads instead of computing them; keys: the quantities.
         """
         graph, exprs = program.graph, program.expressions
         needed = graph.quantities_for(exprs, stored)

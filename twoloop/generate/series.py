@@ -198,7 +198,7 @@ def _sum_of_products(
 
     There are two ways: (1) terms with equal factors share a product; (2) each factor is split into its quantities, and
     terms with the same quantity share a product. The way with fewer new products is taken. If both need as many, (2)
-    is taken for `of_rates` (for G v + (C_t, b)), else (1): (2) may yield (cos x) x', a rate that costs nothing.
+    is taken if `of_rates` (for G v + (C_t, b)), else (1): (2) may yield (cos x) x', the rate of sin x, at no cost.
     """
     total = rest
     by_factor: dict[Any, tuple[Affine, Affine]] = {}
@@ -296,7 +296,7 @@ def _needed_operations(graph: Graph, exprs: list[Affine]) -> list[tuple[int, Any
 
 
 def _nonzero_sums(exprs: list[Affine], nodes: dict[int, int]) -> tuple[Sums, Integers]:
-    """Return the nonzero expressions as Sums, whose `row` is an index in `exprs`; and the indices of all these."""
+    """Return the nonzero expressions as Sums, whose `row` is an index in `exprs`, and their indices in `exprs`."""
     indices = [k for k, expr in enumerate(exprs) if expr.terms or expr.constant]
     sums = _convert_to_sums([exprs[k] for k in indices], nodes)
     index_array = np.array(indices, dtype=np.int64)

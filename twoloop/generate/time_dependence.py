@@ -155,7 +155,7 @@ class GrowthExponents(DegreeAlgebra):
 class DivisorDegrees(DegreeAlgebra):
     """Algebra whose values are total degrees of a quantity's divisors: a sum over factors, a maximum over terms.
 
-    `degrees`: degrees of all quantities. Arguments of arctangents count as divisors, as derivatives are quotients.
+    `degrees`: degrees of all quantities. Arguments of arctangents count as divisors: their derivatives are quotients.
     """
 
     def __init__(self, degrees: DegreeAlgebra):

@@ -47,7 +47,7 @@ from twoloop.kernels.compile.dependencies import FunctionCopier, is_library
 from twoloop.kernels.compile.linking import Dispatcher
 from twoloop.problem.system import ConstrainedSystem
 
-# functions of NumPy that callbacks may call on symbols, because they handle arrays of objects like arrays of numbers
+# functions of NumPy that callbacks may call on symbols: each treats an array of objects like an array of numbers
 NUMPY_FUNCTIONS = {
     *("add", "append", "atleast_1d", "atleast_2d", "block", "column_stack", "concatenate", "copy", "cross", "diag"),
     *("diagonal", "divide", "dot", "einsum", "expand_dims", "flip", "hstack", "inner", "kron", "matmul", "mean"),
@@ -429,7 +429,7 @@ class TraceCache:
         parameters have equal magnitudes; with a minus sign if the parameter is negative.
     Fields:
     parameters : parameters with which callbacks are traced: Parameters with random values, and constants.
-    traced_kinds : names of callbacks that were traced: they do not branch, and always write to the same entries.
+    traced_kinds : names of callbacks that were traced, so they do not branch, and always write to the same entries.
     within_bounds : names of traced callbacks that were found, for one of the systems, to use no index out of bounds.
     """
 
@@ -467,7 +467,7 @@ class TraceCache:
         return self._tape.product_evaluator(self.magnitudes(parameters))
 
     def evaluator(self, parameters: Array) -> Evaluator:
-        """Return a function that evaluates arrays of expressions, which must not change later, for `parameters`."""
+        """Return a function that evaluates arrays of expressions for `parameters`; the arrays must never change."""
         product = self.product_evaluator(parameters)
 
         def evaluate(array: Any) -> Array:
@@ -578,7 +578,7 @@ def _own_cache(system: ConstrainedSystem) -> TraceCache:
 
 
 def _parameter_classes(parameters: Array) -> NDArray[np.int64]:
-    """Return the class of each parameter, see `TraceCache`; classes have numbers in the order of `parameters`."""
+    """Return the class of each parameter, see `TraceCache`; numbers of classes follow the order of `parameters`."""
     magnitudes = np.abs(parameters)
     varies = (magnitudes > MIN_MAGNITUDE) & (magnitudes < 1.0 / MIN_MAGNITUDE) & (magnitudes != np.floor(magnitudes))
     _, first, inverse = np.unique(magnitudes[varies], return_index=True, return_inverse=True)
@@ -593,9 +593,9 @@ class ParameterArrays:
     """Arrays of numbers that stand for arrays of expressions; `write` overwrites them by values for new parameters."""
 
     def __init__(self) -> None:
-        # keys: id of an array of expressions; values: this array, so that no other gets its id, and its numbers
+        # values: an array of expressions, stored so that its id stays unique, and its array of numbers; keys: this id
         self._arrays: dict[int, tuple[Any, Array]] = {}
-        # for each array: its numbers, flat; indices of entries that vary; where `values` in `write` has these entries
+        # for each array: its numbers as a flat array, indices of entries that vary, their range in `values` of `write`
         self._number_arrays: list[tuple[Array, NDArray[np.int64], slice]] = []
         self._products: dict[Powers, int] = {}
         self._scales: list[float] = []
@@ -611,7 +611,7 @@ class ParameterArrays:
         return self._arrays[id(exprs)][1]
 
     def _numbers_for(self, exprs: Any) -> Array:
-        """Return a new array of numbers for `exprs`: constants now, and 0 for Parameters, whose values `write` sets."""
+        """Return a new array of numbers for `exprs`: constants, and 0 for Parameters, which `write` evaluates."""
         entries, begin = exprs.ravel().tolist(), len(self._scales)
         varying = [k for k, entry in enumerate(entries) if type(entry) is Parameter]
         for k in varying:

@@ -36,9 +36,9 @@ MAX_STATES_OF_CHUNK = 32  # a `Sample` takes at most about this number of states
 MAX_STATES = 64  # about the largest number of states at which traces are compared; largest number of chunks in `Sample`
 MAX_STATES_IN_PYTHON = 9  # the same as MAX_STATES, for comparisons with callbacks that are called in Python
 MAX_ENTRIES = 20_000  # about the largest number of entries that are compared: for large systems, fewer states suffice
-# differences of call and trace are relative to the largest term that the trace adds up in any entry of the result
-ROUNDING_DIFFERENCE = 16.0 * np.finfo(float).eps  # a relative difference up to this is a rounding error
-CLEAR_DIFFERENCE = 1e-6  # above this relative difference, the trace is wrong; below, `_is_systematic` decides
+# differences of call and trace are compared with the largest term that the trace adds up in any entry of the result
+ROUNDING_DIFFERENCE = 16.0 * np.finfo(float).eps  # a difference up to this * the largest term is a rounding error
+CLEAR_DIFFERENCE = 1e-6  # the trace is wrong if a difference is above this * the largest term, or is systematic
 # `_is_systematic` compares call and trace at N_NEIGHBOURS states, whose relative distance is at most PERTURBATION
 PERTURBATION, N_NEIGHBOURS = 1e-7, 12
 MARGIN = 0.01  # a CheckedRegion extends the range of each entry of checked states [t, q, v] by this * (max - min)
