@@ -74,8 +74,8 @@ from twoloop.run.workspace import GAMMA_ACCURACY, sparse_factors_pay
 Array = NDArray[np.float64]
 
 MAX_IDLE = 4  # largest number of unused integrators kept for equal options; each thread that integrates takes one
-# the first call of compiled code attempts at most this many times `Run.chunk` steps (once if `StiffnessMonitor` must
-# sample a state after each chunk). With more steps, a run could ignore Ctrl-C for more than 0.1 s
+# largest number of chunks, of `Run.chunk` attempted steps each, in the first call of compiled code: with more steps, a
+# run might ignore Ctrl-C for more than 0.1 s. If `StiffnessMonitor` must sample a state after each chunk, use 1 chunk
 N_FIRST_CHUNKS = 4
 N_SKIPPED_CALLS = 16  # after an exception in a callback, this number of calls do not use the cached integrator
 STEP_FIELDS = (*STEP_ARRAYS, "stats")  # fields of a result that are computed from the array of steps
@@ -141,7 +141,7 @@ class CachedIntegrator:
     @staticmethod
     def can_provide(run: Run, output: OutputRequest, shared: SharedSetup | None) -> bool:
         """Return whether a cached integrator can provide the requested `output`; if not, a new run must be set up."""
-        # states at output times and `result.sol` must agree, but each would get an interpolator of its own. If systems
+        # states at output times and `result.sol` must agree, but would come from different interpolators. If systems
         # share the run (`shared`), the next system would overwrite the parameters that `result.sol` uses
         if output.dense and (output.interpolated_times is not None or shared is not None):
             return False
@@ -364,7 +364,7 @@ def _deferred_field(
     return NON_STEP_DEFAULTS | state_fields(system.n_q, t, rows) | fields | options.metadata
 
 
-RECHECK_PIVOT = 0.1  # `set_up` checks a start if (smallest pivot there) / (smallest pivot at first start) is below this
+RECHECK_PIVOT = 0.1  # `set_up` checks a start if (smallest pivot of C_q) / (this pivot at first start) is below this
 
 
 def arrays_of(
@@ -485,7 +485,7 @@ def cached_result(
     """Integrate with the cached integrator for a system and options; create the integrator at the first call.
 
     Return one of four: (fields of the result, warning about redundant rows or ""); a RepeatRequest; a `Run` at its
-    start, which the caller integrates, as no cached integrator can; None if the caller must call `set_up` for a run.
+    start, which the caller integrates because no cached integrator can; None if the caller must call `set_up`.
     """
     entries = system.derived.get("runs", EMPTY_CACHE)[1].get(options.key, ())
     if not entries and (shared := system.shared.get("runs")):

@@ -325,7 +325,7 @@ class Interpolator:
         return self.repair_plans[is_stiff]
 
     def _split_intervals(self, table: StateTable, intervals: Integers) -> tuple[StateTable, Integers, Integers]:
-        """Return a StateTable of cached states within `intervals`, the intervals that have these, and the others."""
+        """Return a table of cached states within `intervals`, the intervals with such states, and those without."""
         start_times = table.t[intervals[:, indices.FIRST_OWN]].tolist()
         is_divided = np.array([t in self.interior_states for t in start_times], dtype=bool)
         pairs = [self.interior_states[t] for t in start_times if t in self.interior_states]
@@ -367,7 +367,7 @@ class Interpolator:
     def interior_blocks(self, table: StateTable) -> Iterator[tuple[Array, Array]]:
         """Yield the states within all divided intervals, in blocks, so that the caller can store them in a file.
 
-        A block has times (m, parts + 1) and rows [q, v, a] (m, parts + 1, 3 n_q) of m intervals; missing ones are NaN.
+        A block has times (m, parts + 1) and rows [q, v, a] (m, parts + 1, 3 n_q) of m intervals. Missing: NaN.
         """
         intervals = _interval_rows(table, np.arange(len(table.t) - 1))
         for block in _blocks_of_intervals(intervals):
@@ -398,7 +398,7 @@ class Interpolator:
             failures = fill(self.kit, self.work, times, states, out)
         self.failures, n = failures, self.system.n_q
         if failures > 0:
-            # at a start in a singular position, store the known accelerations; multipliers stay NaN, as the run warned
+            # at a start in a singular position, store the known accelerations; multipliers stay NaN: the run warned
             is_missing = np.isnan(out[:, :n]).any(axis=1)
             out[is_missing & (times == self.arguments[1]), :n] = self.arguments[2][2 * n :]
             n_missing = int(np.isnan(out[:, :n]).any(axis=1).sum())
@@ -468,7 +468,7 @@ class OutputInterpolation:
             return None
         a_and_lam = np.full((len(times), len(self.run.state) - rows.shape[1]), np.nan)
         interpolator.fill_accelerations(times, rows, a_and_lam)
-        if interpolator.fixed_order is not None or interpolator.repair_plans:  # other runs cannot use its workspace
+        if interpolator.fixed_order is not None or interpolator.repair_plans:  # other runs cannot use this interpolator
             self._interpolator = None
         return np.concatenate([rows, a_and_lam], axis=1) if interpolator.failures == 0 else None
 
@@ -571,7 +571,7 @@ class DenseSolution:
         self.t_min, self.t_max = float(table.t[0]), t_max
 
     def __call__(self, t: ArrayLike) -> DenseState:
-        """Return the state at one time, or at times (n,) in any order; raise if one is not within the run."""
+        """Return the state at one time, or at times (n,) in any order; ValueError if a time is not in the run."""
         times = check_real("t", t)
         if times.ndim > 1:
             raise ValueError(f"t must be a number or have shape (n,); given {shaped(times)}")

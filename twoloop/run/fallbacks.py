@@ -184,8 +184,8 @@ def cross_singularity(run: Run, past: list[TimedState]) -> tuple[Plan, Array]:
     base, run.mirrored_size = None, 0.0
     if not has_fixed_step:
         base, run.mirrored_size = _find_base_state(run, [(t, state) for t, state in past if t >= earliest])
-    # try polynomials that begin at several states: one may have nodes before a jump of a force; near the start or the
-    # end of the run, there may be too few nodes; a polynomial from an old state may be too long
+    # try polynomials that begin at several states: a polynomial may have nodes before a jump of a force, too few nodes
+    # (near the start or the end of the run), or be too long (from an old state)
     h_long, compiled = float(clock[a.H_LONG]), not run.system.called_in_python
     near_start = compiled and _is_near_start(run)
     near_end = compiled and clock[a.T] + LARGEST_RATIO * h_long > run.t1
@@ -306,8 +306,8 @@ def crossing_kit(kit: Kit) -> Kit:
 def handle_crossing(run: Run, plan: Plan, control: Array, code: int, n_accepted: int) -> tuple[Plan, Array, int]:
     """Decide how to go on after an attempt to cross a singular position; return plan, `control` and code of next steps.
 
-    If the attempt has yielded a polynomial, the next steps follow it piece by piece. If it failed, another step size or
-    polynomial is tried. After the crossing, or if nothing is left to try, the run's own method continues.
+    If the attempt has yielded a polynomial, the next steps follow this piece by piece. If the attempt failed, another
+    step size or polynomial is tried. After the crossing, or if all attempts failed, the run's own method continues.
     """
     from twoloop.kernels.steps import crossing_step as kernels
 

@@ -262,7 +262,7 @@ class IntegrationLoop:
     def _handle_code(self, steps: Array, in_crossing: bool, chunk_time: float) -> None:
         """Act on the code in `self.code`, with which a chunk ended; if the run goes on, replace it by PAUSED.
 
-        `in_crossing`: whether the chunk tried to cross a singular position. `chunk_time`: its CPU time (s).
+        `in_crossing`: whether the chunk tried to cross a singular position. `chunk_time`: CPU time of the chunk (s).
         """
         if self.code == self.run.a.ALL_OUTPUT_DONE:
             if self.stiffness_monitor.samples:
@@ -379,7 +379,7 @@ class IntegrationLoop:
             self.plan, self.control, self.kit, self.code = run.plan, run.control, run.kit, a.PAUSED
         elif self.code == a.NEEDS_COMPILATION:
             began = time.monotonic()
-            load_step(run.plan.second)  # compile it, or load it from disk: the second step of a pair of methods
+            load_step(run.plan.second)  # compile the second step of a pair of methods, or load it from disk
             renew_kit(run)
             self.deadline += time.monotonic() - began  # compilation does not count against time_limit
             self.kit, self.code = run.kit, a.PAUSED

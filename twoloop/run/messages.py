@@ -171,7 +171,7 @@ def _fastest_rates(kit: Any, work: Any, sample: StiffnessSample, directions: lis
 def _dominant_eigenvalue(
     kit: Any, work: Any, sample: StiffnessSample, direction: Array, independent: NDArray[np.int64], by_v: bool
 ) -> tuple[float, bool]:
-    """Return |dominant eigenvalue| of dF/dq, or of dF/dv if `by_v`, and whether it is negative, by power iteration.
+    """Find the dominant eigenvalue of dF/dq (of dF/dv if `by_v`) by power iteration; return (|value|, is negative).
 
     F: accelerations of the coordinates `independent` (indices). `direction`: first vector, becomes the eigenvector.
     """
@@ -196,8 +196,8 @@ def _dominant_eigenvalue(
     return eigenvalue, is_negative
 
 
-# messages call C_q nearly singular if its smallest singular value is at most this fraction of its largest one. They say
-# that inertia is missing if the same holds for the eigenvalues of M on the velocities that the constraints allow
+# messages call C_q nearly singular if (smallest / largest singular value) is at most this. They say that inertia is
+# missing if (smallest / largest eigenvalue) of M on the velocities that the constraints allow is at most this
 MAX_SINGULAR_RATIO = 1e-3
 # a result is not trusted if rounding errors of velocities (or accelerations) exceed this multiple of the tolerances
 MAX_LASTING_ERROR = 100.0
@@ -259,7 +259,7 @@ def reject_velocity_jumps(
 def describe_rounding(run: "Run", states: list[TimedState], end: float) -> str:
     """Find the earliest of `states` where rounding changes v by more than MAX_LASTING_ERROR tolerances.
 
-    Return a sentence about it, or "" if there is none. States at or after the time `end` are not checked.
+    Return a sentence about this state, or "" if there is no such state. Do not check states at or after the time `end`.
     """
     system, n = run.system, run.system.n_q
     for t, state in sorted({each[0]: each for each in states}.values(), key=itemgetter(0)):
@@ -278,7 +278,7 @@ def describe_rounding(run: "Run", states: list[TimedState], end: float) -> str:
 
 
 def describe_arrival(t: float, fixed: bool) -> str:
-    """Return the first sentence of the message of a run that reached its end; `fixed`: its step size was constant."""
+    """Return the first sentence of the message of a run that reached its end; `fixed`: if step sizes were constant."""
     return f"Reached the end, t = {t:g}{', with a constant step: no error was estimated' if fixed else ''}."
 
 

@@ -56,7 +56,7 @@ class _SparseProjection:
         return int(entry_point(self.kit.inner)(self.kit, self.work, task, self.t, q, v, 0.0, a, lam))
 
     def allowed_part(self, displacement: Array) -> Array:
-        """Return a displacement (n_q,) projected onto those that C_q at `self.position` allows."""
+        """Return the projection of a displacement (n_q,) onto the displacements that C_q at `self.position` allows."""
         rows = self.system.sparse_rows(self.t, self.position)
         change = np.zeros(len(displacement))
         zero, residual = np.zeros(len(displacement)), np.ascontiguousarray(rows @ displacement)
@@ -384,8 +384,8 @@ def _describe_other_assembly(
 ) -> str | None:
     """Check whether guesses as far from the projected position q1 as `guess` may lead to another assembly.
 
-    Return None if they do not, else a phrase on a guess that may. A guess leads to the same assembly if it is projected
-    to about the point that C_q predicts to first order, and the determinant of the dependent columns keeps its sign.
+    Return None if no guess may, else a phrase on a guess that may. A guess leads to the same assembly if projected to
+    about the point that C_q predicts to first order, and the determinant of the dependent columns keeps its sign.
     Else, Newton's method starts from the independent coordinates of q1 and the dependent ones of the projected guess:
     if it does not lead back to q1, there is another assembly.
     """

@@ -147,8 +147,8 @@ class OutputRequest(NamedTuple):
 class Recorder:
     """Recorder of the states of accepted steps, which it receives in chunks (steps of one call of compiled code).
 
-    The polynomial of a step also interpolates later states. The step is searched for events only when these are known:
-    so results do not depend on the size of chunks. Event functions are evaluated at least every `max_gap` seconds.
+    The polynomial of a step also interpolates later states. A step is searched for events only when those states are
+    known: so results do not depend on chunk sizes. Event functions are evaluated at least every `max_gap` seconds.
     """
 
     def __init__(

@@ -134,9 +134,9 @@ def python_functions(system: ConstrainedSystem) -> PythonFunctions | None:
 
 
 def first_force(system: ConstrainedSystem, t0: float, q0: Array, v0: Array) -> tuple[Any, Array] | None:
-    """Return ((t0, q0, v0), compiled force there) for `describe_changed_force`; None if it fails.
+    """Return ((t0, q0, v0), value of the compiled force) for `describe_changed_force`; None if the force fails.
 
-    Also None if the force is a Python function: the samples of its calls, kept for the same check, begin anew.
+    If the force is a Python function, return None, and delete the samples of its calls, which serve for the same check.
     """
     if functions := python_functions(system):
         functions.restart()

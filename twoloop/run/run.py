@@ -143,7 +143,7 @@ class Run:
         return new_run
 
     def copy_to_start(self, t0: float, q0: Array, v0: Array) -> "Run | None":
-        """Return a copy of this run at another start; None if ranks differ there, or accelerations cannot be computed.
+        """Return a copy of this run at another start; None if ranks differ, or accelerations cannot be computed.
 
         The run must not use the fixed-order form (sparse factors in a fixed order of elimination).
         """
@@ -284,7 +284,7 @@ class Run:
             clock[a.FAILURE_CODE] = indices.DONE
         state = self.state.copy()
         code = entry_point(self.kernels.start)(self.kit, self.work, t, state)
-        if code == indices.RANK_DIFFERS:  # keep the rank at the start of the run, even if it is higher now
+        if code == indices.RANK_DIFFERS:  # keep the rank at the start of the run, even if the rank is higher now
             self.work.notes[indices.GENERATION] = 1.0
             code = entry_point(self.kernels.start)(self.kit, self.work, t, state)
         if old_work.notes[indices.PIVOT] > 0.0 and largest_pivot > 0.0:  # pivots have another scale now
@@ -312,7 +312,7 @@ class Run:
             self.system.derived["ranks"] = ranks
             self.work = self._make_workspace(*ranks)
             code = start(self.kit, self.work, self.t0, self.state)
-        if code == indices.GAMMA_INACCURATE:  # ignore it here: the first step reports it in a result
+        if code == indices.GAMMA_INACCURATE:  # ignored here: the first step reports this error in a result
             required_accuracy = self.work.notes[indices.GAMMA_REQUIRED]
             self.work.notes[indices.GAMMA_REQUIRED] = np.inf
             code = start(self.kit, self.work, self.t0, self.state)
@@ -420,9 +420,9 @@ class Run:
         return float(notes[indices.LARGEST_DEFECT]) if is_checked else None
 
     def passed_near_singular(self) -> bool:
-        """Return whether a singular position was near at an output time, or at the end of a step of fixed size.
+        """Return whether rounding may have changed output velocities, because a singular position was near.
 
-        Rounding may have changed velocities there.
+        This is checked at output times, and at the ends of steps of fixed size.
         """
         # pivots of the fixed-order form vary more: there, only a ratio below SMALL_PIVOT shows a singular position
         threshold = self.near_threshold if self.fixed_order is None else SMALL_PIVOT

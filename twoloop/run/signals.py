@@ -14,7 +14,7 @@ from twoloop.problem.system import ConstrainedSystem
 
 # code objects of the two functions of twoloop that call the user's callbacks and event functions
 CALLERS_OF_USER_CODE = (PythonFunctions.call.__code__, Event.__call__.__code__)
-COMPILERS = ("numba", "llvmlite")  # packages in which a handler must not raise: their data would be left incomplete
+COMPILERS = ("numba", "llvmlite")  # packages in which a handler must not raise: data of these would be left incomplete
 # signals whose handlers are replaced; not all of them exist on Windows
 SIGNAL_NAMES = ("SIGALRM", "SIGINT", "SIGTERM", "SIGUSR1", "SIGUSR2", "SIGVTALRM", "SIGPROF", "SIGHUP")
 SIGNAL_NUMBERS = [int(getattr(signal, name)) for name in SIGNAL_NAMES if hasattr(signal, name)]
@@ -42,7 +42,7 @@ class SignalHandlers:
                         break  # Python calls signal handlers in the main thread only
                     self._user_handlers[number] = handler
                     _signal.signal(number, self._receive)
-        except BaseException:  # a signal has arrived meanwhile, and its handler has raised this
+        except BaseException:  # raised by the handler of a signal that has arrived meanwhile
             self.restore()
             raise
 

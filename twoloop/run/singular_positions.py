@@ -17,7 +17,7 @@ from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
 TimedState = tuple[float, Array]  # time and state [q, v, ...]
-# for each singular position that steps crossed: the state before it; if the crossing was completed, the state after it
+# for each singular position that steps crossed: the state before and, if the crossing was completed, the state after it
 Crossings = list[list[TimedState]]
 Ratio = Callable[[ConstrainedSystem, float, Array, int], float]
 
@@ -83,7 +83,7 @@ def _least_ratio_between(
     n, (t0, first), (t1, last) = system.n_q, before, after
     if t1 == t0:
         return ratio(system, t0, first[:n], rank)
-    from scipy.interpolate import CubicHermiteSpline  # imported here, as that takes 0.1 s and few runs need it
+    from scipy.interpolate import CubicHermiteSpline  # imported here: the import takes 0.1 s, and few runs need it
 
     path = CubicHermiteSpline([t0, t1], [first[:n], last[:n]], [first[n : 2 * n], last[n : 2 * n]])
     return min(ratio(system, float(t), path(t), rank) for t in np.linspace(t0, t1, N_POSITIONS))
@@ -92,10 +92,10 @@ def _least_ratio_between(
 def describe_velocity_jump(
     system: ConstrainedSystem, crossings: Crossings, end_state: TimedState, rank: int, rtol: float, atol: Array
 ) -> str:
-    """Return a message about the first singular position where velocities jumped; "" if there is none.
+    """Return a message about the first singular position where velocities jumped; "" if velocities did not jump.
 
-    A jump is a change larger than accelerations explain. Near such a position the tolerances do not distinguish the
-    branches of the motion, and steps may have switched to another branch.
+    A jump is a change larger than accelerations explain. Near a singular position, the tolerances may not distinguish
+    the branches of the motion, and steps may have switched to another branch.
     """
     n = system.n_q
     of_q, of_v = slice(n), slice(n, 2 * n)
@@ -202,7 +202,7 @@ SMALL_PIVOT, PIVOT_FACTOR = 1e-5, 30.0
 
 
 def singular_threshold(rtol: float) -> float:
-    """Return a limit of (smallest / largest pivot): below it, rounding may change v by REPORTED_ERROR times rtol."""
+    """Return the ratio (smallest / largest pivot) below which rounding may change v by REPORTED_ERROR times rtol."""
     return min(
         WEAK_RATIO, max(SMALL_PIVOT, PIVOT_FACTOR * float(np.sqrt(ROUNDING / (REPORTED_ERROR * max(rtol, ROUNDING)))))
     )

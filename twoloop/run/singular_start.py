@@ -29,13 +29,13 @@ MAX_DIFFERENCE_ERROR = 1e-8
 # the rank of C_q rises along the motion if (ds/dt) / |dC_q/dt| exceeds this; s: a singular value, zero at the start
 MIN_RANK_DERIVATIVE = 1e-6
 # the time derivative of a singular value that is zero at the start is certainly not zero if it exceeds this number
-# times its uncertainty, which is the norm of dC_q/dt for a velocity as large as the tolerances
+# times an uncertainty: the norm of dC_q/dt for a velocity as large as the tolerances
 MIN_CLARITY = 10.0
 # BESIDE_CHANGE: relative change of C_q from the singular start to the nearby state from which the run starts;
 # STEP_CHANGE: relative change of C_q in the first step
 BESIDE_CHANGE, STEP_CHANGE = 0.1, 0.6
-# up to N_BESIDE states near the singular start are tried, each half as far away as the one before; one is accepted if
-# its projection onto the constraints moves it by at most MAX_CORRECTION times its distance from the start
+# up to N_BESIDE states near the singular start are tried, each half as far away as the last. A state is accepted if its
+# projection onto the constraints moves it by at most MAX_CORRECTION times the state's distance from the start
 N_BESIDE, MAX_CORRECTION = 6, 0.2
 MAX_RESIDUAL = 1e-6  # largest residual allowed in the equations for the accelerations, relative to the right-hand side
 
@@ -129,5 +129,5 @@ def _branch_at(system: ConstrainedSystem, t: float, state: Array, rank: int, all
 
 
 def _time_of_change(change: float, speed: float, acceleration: float) -> float:
-    """Return the time (s) in which C_q changes by the fraction `change`, given (its time derivatives) / |C_q|."""
+    """Return the time (s) in which C_q changes by the fraction `change`, given (its two time derivatives) / |C_q|."""
     return 2.0 * change / (speed + float(np.sqrt(speed * speed + 2.0 * acceleration * change)))

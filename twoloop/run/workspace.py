@@ -70,7 +70,7 @@ def newton_form(
         q = q0 + scale * magnitude * rng.uniform(-1.0, 1.0, system.n_q)
         try:
             entries |= _derivative_entries(system, t0, q, rng.uniform(-1.0, 1.0, system.n_q), lam, max_entries)
-        except Exception:  # callbacks fail at q: skip it; a run finds the entries missed here later
+        except Exception:  # callbacks fail at q: skip this position; a run later finds the missing entries
             continue
         if len(entries) > max_entries:
             return None
@@ -111,9 +111,9 @@ def _derivative_entries(
     return entries
 
 
-MASSLESS_RATIO = 1e-10  # an eigenvector of a body's block of M is massless if eigenvalue / largest one is at most this
-# a singular M becomes invertible if g^T g is added to it for some rows g of C_q. A row may be chosen if its component
-# along massless directions is longer than this fraction of its norm
+MASSLESS_RATIO = 1e-10  # eigenvectors of a body's block of M are massless if eigenvalue / (largest eigenvalue) <= this
+# a singular M becomes invertible if g^T g is added for some rows g of C_q. A row g may be chosen if the component of g
+# along massless directions is longer than this fraction of |g|
 MIN_MASSLESS_FRACTION = 1e-3
 MIN_SIZE_NEWTON = 1.6  # Newton's matrix gets dense factors if n_q < this * LARGE (smallest n_q of a large system)
 MAX_SHARE = 0.05  # M and C_q are factorized as sparse matrices if this takes at most this fraction of dense operations
@@ -221,8 +221,8 @@ def _stiff_rows(
 ) -> list[int]:
     """Choose the rows g of C_q for which g^T g is added to a singular M to make it invertible; return their indices.
 
-    See sparse_ldl.py. A row must belong to one body, such as the norm of its Euler parameters, so that g^T g has no
-    entries where M has none. Rows are chosen only until M is invertible.
+    See sparse_ldl.py. A row must belong to one body (as for the norm of Euler parameters), so that g^T g has no entries
+    where M has none. Rows are chosen only until M is invertible.
     """
     values = system.mass_values(t0, q0) if "mass" in system.entries else system.mass(t0, q0)[mass]
     body_of = np.array(bodies_of(system.n_q, mass, bodies))
@@ -282,7 +282,7 @@ def _mass_pattern(system: ConstrainedSystem, t0: float, q0: Array) -> Array:
     for scale, direction in zip(NEARBY[:1] if system.constant_mass else NEARBY, directions, strict=False):
         try:
             mass = system.mass(t0, q0 + scale * magnitudes * direction)
-        except Exception:  # callbacks fail at this position: skip it; a run finds the entries missed here later
+        except Exception:  # callbacks fail: skip this position; a run later finds the missing entries
             continue
         pattern[(mass != 0.0) | (mass.T != 0.0)] = 1.0
     return pattern
@@ -375,7 +375,7 @@ def kit_for_plan(system: ConstrainedSystem, flags: Array, plan: Plan | None) -> 
         if len(kits) == MAX_KITS:
             del kits[next(iter(kits))]
         entry = kits[key] = Kit(functions, inner, *steps), system.functions
-    # a run in the augmented form may change the flags of its kit: give it a copy, not the cached kit
+    # a run in the augmented form may change the flags of its kit: return a copy, not the cached kit
     return _copy_with_flags(entry[0]) if flags[FORM] == AUGMENTED else entry[0]
 
 

@@ -65,7 +65,7 @@ MAX_ROUNDING_CORRECTION_FIXED = 1e-9
 def _solve_stages(f, w, options, memory, t, h, tolerances, q, v, A_stage):
     """Solve for the stage accelerations A_stage (s, n) by Newton's method; return DONE or a failure code.
 
-    On entry, A_stage contains the first guesses. memory[CONTRACTION] becomes last / last but one Newton correction.
+    A_stage must contain first guesses. memory[CONTRACTION] becomes the ratio of the last two Newton corrections.
     """
     s, A, A2, _, _, c = tableau_of(options)
     n = q.size
@@ -287,8 +287,8 @@ def newton_step(f, w, options, memory, t, h, tolerances, state, new_state):
             break
         if memory[at.IS_FRESH] == 1.0 and (node == 0.0 or code != OUTER_DIVERGED):
             return Attempt(code, np.inf, 0.0)
-        # no convergence: compute new derivatives, and try again. If they are new already, they may be wrong (as for
-        # friction), because the middle stage is extrapolated: compute them at the beginning of the step
+        # no convergence: compute new derivatives, and try again. Derivatives that are already new may be wrong (as for
+        # friction), because the middle stage is extrapolated: then compute them at the beginning of the step
         if memory[at.IS_FRESH] == 1.0:
             node = 0.0
         memory[at.HAS_JACOBIAN] = 0.0

@@ -443,7 +443,7 @@ def _fill_banded_tangents(f, w, tolerances, memory, s, t, q, v):
     )
     if code != DONE:
         return code
-    # displace all velocities at once: if this does not change the residual, D, its derivative by velocities, is zero
+    # displace all velocities at once: if this does not change the residual, the derivative D by velocities is zero
     size = typical_size(tolerances, v)
     for j in range(n):
         moved[j] = displace_unequally(v[j], size, j)
@@ -662,7 +662,7 @@ def _has_complete_pattern(f, base, residual, base_point, moved, largest, entries
 def _fill_sparse_tangents(f, w, tolerances, memory, t, q, v):
     """Store the sparse K and D (derivatives of the residual by q, v) at the last evaluated state; return a code.
 
-    The code is NEEDS_DENSE if there is no program for sparse storage, or if its sparsity pattern lacks entries.
+    The code is NEEDS_DENSE if there is no program for sparse storage, or if the pattern of K or D lacks entries.
     """
     if f.newton_program.size == 0:
         return NEEDS_DENSE

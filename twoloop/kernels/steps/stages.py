@@ -350,12 +350,12 @@ LOADED_STEPS: dict[LazyStep, Step] = {}  # steps whose modules have been importe
 
 
 def load_step(step: Any) -> Any:
-    """Return the Step to which `step` refers (importing its module if `step` is a LazyStep); return a Step itself."""
+    """Return the Step to which a LazyStep refers, after importing the module of this Step; return a Step unchanged."""
     if isinstance(step, LazyStep) and step not in LOADED_STEPS:
         LOADED_STEPS[step] = getattr(import_module(f"twoloop.kernels.{step.module}"), step.name)
     return step_if_loaded(step)
 
 
 def step_if_loaded(step: Any) -> Any:
-    """Return the Step to which `step` refers, or PLACEHOLDER_STEP if this Step is not imported yet."""
+    """Return the Step to which a LazyStep refers (PLACEHOLDER_STEP if not imported yet); return a Step unchanged."""
     return LOADED_STEPS.get(step, PLACEHOLDER_STEP) if isinstance(step, LazyStep) else step

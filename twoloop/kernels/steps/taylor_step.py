@@ -341,8 +341,8 @@ def finish_series(w, order, series):
 def compute_coefficients(f, w, options, memory, t, state, unit):
     """Compute the Taylor series about `state` at t, with the unit of time `unit` (s); return DONE or NOT_FINITE.
 
-    The series overwrites the one of the two stored series whose index is memory[TARGET]. The linear system of each
-    order is solved with the factors that w has from the accelerations at this state.
+    The result overwrites the stored series with the index memory[TARGET]. The linear system of each order is solved
+    with the factors that w has from the accelerations at this state.
     """
     n, n_rows, order = w.Q.size, w.Rate.size, int(options[ORDER])
     N, X1, Y1, X2, Y2, total1, total2, r, c = array_views(options, memory, n, n_rows)
@@ -382,9 +382,9 @@ def compute_coefficients(f, w, options, memory, t, state, unit):
     return finish_series(w, order, series)
 
 
-TARGET_PREDICTION_ERROR = 0.3  # aim: (distance of a step's end from the constraints before projection) / allowed one
-# the series is exact near the beginning of a step, at NEAR_BEGIN: its defect there shows the rounding error. A later
-# defect counts as rounding error, too, if it is at most NOISE_RATIO times as large, and MAX_NOISE * allowed defect
+TARGET_PREDICTION_ERROR = 0.3  # aim of step sizes: (distance of ends from constraints) / (allowed distance)
+# the defect at NEAR_BEGIN, near the beginning of a step, is due to rounding, because the series is exact there. A later
+# defect counts as rounding error if it is at most NOISE_RATIO times this, and at most MAX_NOISE * (allowed defect)
 MAX_NOISE, NOISE_RATIO = 1e4, 10.0
 NEAR_BEGIN = 1e-5  # time from the beginning of a step to a state where the series is exact, relative to the step size
 # the defect is checked at equidistant times within a step. At each attempt, these times shift by this fraction of their
@@ -402,7 +402,7 @@ def _compute_series(f, w, options, memory, t, state, unit, index):
     """Compute the Taylor series about `state`, which was projected last; store it as series `index` (0 or 1)."""
     n = w.Q.size
     memory[TARGET] = index
-    if f.is_generated == 1 and w.used_general == 0.0:  # generated code has stored no factors in w: compute them
+    if f.is_generated == 1 and w.used_general == 0.0:  # generated code has stored no factors in w: compute the factors
         q, v, a = state[:n], state[n : 2 * n], series_accelerations(memory, n)
         code = f.general(f, w, EVALUATE_WITHOUT_PROJECTION, t, q, v, 0.0, a, w.lam)
         if code != DONE:
