@@ -39,7 +39,7 @@ DOUBLE_POINTER = f"{DOUBLE}*"
 # generated code is not used if the relative error of its accelerations near the start is larger. This is checked only
 # if rows of G are added to M, or solutions are refined (see PivotChoice). During runs, the error grew up to 200 times
 LARGEST_LOSS = 1e-8
-MAX_POSITIONS, SPACING = 4, 0.02  # number and spacing (m or rad) of positions; the first with large pivots is used
+MAX_POSITIONS, SPACING = 4, 0.02  # number and spacing (m or rad) of positions that are tried to check LARGEST_LOSS
 
 
 def write_accelerations(
@@ -164,7 +164,7 @@ def _acceleration_function(emit: Emitter, equations: Elimination, index: int, nu
 
 
 def _coefficient_pointers(emit: Emitter) -> list[Value]:
-    """Return a pointer to all coefficients; in SIMD lanes, pointers to those that vary between lanes, and to others."""
+    """Return a pointer to all coefficients; in SIMD lanes, to those that vary between lanes and to the others."""
     constants = getattr(emit, "constants", None)
     return [emit.numbers] if constants is None else [emit.numbers, constants]
 

@@ -20,7 +20,7 @@ from twoloop.generate.trace import GAMMA_SOURCES, Equations, Evaluator, TraceCac
 from twoloop.generate.traced_values import CallbackTraces, Check, accept_traces
 from twoloop.problem.system import ConstrainedSystem
 
-# keys: callbacks that are derived if the user does not give them; values: the system's attribute for their size
+# keys: callbacks that are derived if the user does not give them; values: attribute that is their number of rows
 DERIVABLE_CALLBACKS = {"jacobian": "n_c", "gamma": "n_c", "nonholonomic_gamma": "n_a"}
 
 
@@ -125,7 +125,7 @@ def _trace_derivatives(system: ConstrainedSystem, cache: TraceCache) -> Callback
     equations = cache.equations(system)
     callbacks = [kind for kind in ("jacobian", *GAMMA_SOURCES) if kind in system.given]
     exprs = {kind: equations.derivatives(kind) for kind in (*callbacks, *(["constraint_rate"] if system.n_c else []))}
-    # derivatives of a wrong trace are wrong: so also compare the callbacks that were differentiated with their traces
+    # derivatives of a wrong trace are wrong: so traces of differentiated callbacks are compared with calls, too
     exprs |= {kind: equations.expressions(kind) for kind in ("constraint", "nonholonomic", "nonholonomic_rate")}
     return CallbackTraces(system, equations.graph, exprs)
 

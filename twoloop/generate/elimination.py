@@ -61,9 +61,9 @@ START_LIMITS = MIN_PIVOTS[:-1] / PIVOT_FRACTION
 # longer, and i must be at least MIN_INDEX_MANY, or MIN_INDEX_MANY + 1 if M is singular
 N_FEW_COORDINATES = 24
 MIN_INDEX_FEW, MIN_INDEX_FEW_SINGULAR, MIN_INDEX_MANY = 4, 5, 6
-ADDED_SIZE = 16.0  # the scale s is chosen so that the largest entry of s G^T G is about this * that of M
-MAX_PIVOT_RATIO = 1e5  # solutions are refined if a diagonal entry of M with added rows is above this * the row's pivot
-SCALE_STEP = 1024.0  # scales of rows added to M differ by powers of this number, so large that most starts share code
+ADDED_SIZE = 16.0  # scales s are chosen so that the largest entry of s G^T G is about this * the largest entry of M
+MAX_PIVOT_RATIO = 1e5  # solutions are refined if a diagonal entry of M + s G^T G is above this * the pivot of its row
+SCALE_STEP = 1024.0  # scales s of terms s g^T g in M differ by powers of this, so large that most starts share code
 DISPLACEMENT = 0.2  # displacement of coordinates (m or rad) to a position where no entry of M and G is zero by chance
 MIN_GAIN = 2  # M + s G^T G replaces M if the limit of relative pivots rises by at least this many powers of ten
 # dependent coordinates are eliminated (null_space.py) only if there are at least this many constraints per coordinate:
@@ -199,7 +199,7 @@ class PivotChooser:
         return choice
 
     def _min_pivot_index(self, choice: PivotChoice, scales: Sequence[float], mass: Array, G: Array) -> int:
-        """Return the index, in MIN_PIVOTS, of the limit of relative pivots if `choice.added_rows` are added to M.
+        """Return the index, in MIN_PIVOTS, of the limit of relative pivots for M + s g^T g (g: `choice.added_rows`).
 
         Return -1 if M with added rows is not positive definite, or if the independent rows differ from `choice.rows`.
         """
@@ -272,7 +272,7 @@ def _scale_factors(singular: Sequence[int], mass: Array, G: Array) -> Array:
 
 
 def _may_lose_digits(choice: PivotChoice, mass: Array, G: Array) -> bool:
-    """Return True if light bodies may lose digits: M has added rows, and a small pivot or rows of several scales."""
+    """Return True if light bodies may lose digits: M + s g^T g replaces M, with a small pivot or several scales s."""
     if not choice.added_rows:
         return False
     added, scales = G[list(choice.added_rows)], np.array(choice.scales)
@@ -347,7 +347,7 @@ class Elimination:
         return Program(self.graph, {"": []}, conditions)
 
     def _matrix(self) -> dict[tuple[int, int], Affine]:
-        """Return the nonzero entries of [M G^T; G 0]. G has only the independent rows; M includes added terms."""
+        """Return the nonzero entries of [M G^T; G 0]. G has only the independent rows; M includes terms s g^T g."""
         n = self.system.n_q
         matrix = {(i, j): self.mass[i, j] for i in range(n) for j in range(n) if not is_zero(self.mass[i, j])}
         for i, j in matrix:
@@ -414,7 +414,7 @@ class Elimination:
 
     @cached_property
     def right_sides(self) -> Program:
-        """Return the program for forces "r", and "c" of G a = c; c is 0 in redundant rows that are not added to M."""
+        """Return the program for "r" (forces) and "c" in G a = c; c is 0 in redundant rows that are not added to M."""
         force, gamma = self._right_sides(self.v)
         used = {*self.choice.rows, *self.choice.added_rows}
         return Program(self.graph, {"r": force, "c": [x if k in used else self.zero for k, x in enumerate(gamma)]})
@@ -438,7 +438,7 @@ class Elimination:
 
     @cached_property
     def velocity_errors(self) -> Program:
-        """Return the program for "c" in G (change of v) = c; c is -(C_q v + C_t), -(A v + b), or 0 if redundant."""
+        """Return the program for "c" in G (change of v) = c; c is -(C_q v + C_t), -(A v + b); 0 in redundant rows."""
         errors = []
         for row, rate in zip(self.rows, self.rates, strict=True):
             total = rate

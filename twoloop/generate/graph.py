@@ -483,7 +483,7 @@ class Derivative:
         return total
 
     def _differentiate_quantity(self, i: int) -> Affine:
-        """Return the derivative of quantity i; first compute those of the quantities on which it depends."""
+        """Return the derivative of quantity i; first compute the derivatives of the quantities in its definition."""
         stack = [i]  # no recursion, because products may be nested more deeply than Python's limit
         while i not in self._derivatives:
             op = self.graph.operations[stack[-1]]

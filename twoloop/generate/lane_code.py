@@ -88,7 +88,7 @@ class LaneSteps:
         self.n, self.n_rows = n, n_rows
 
     def update_unit(self, emit: LaneEmitter, control: Value, work: Value) -> Value:
-        """Write code that stores UNIT, the series' unit of time: the step size (s) that the last series allows."""
+        """Write code that stores UNIT (s), the unit of time of a series: the step size that the last series allows."""
         select, unit = emit.builder.select, emit.load(work, lanes.UNIT)
         is_fresh, is_accepted = (is_set(emit, work, field) for field in (lanes.IS_NEW, lanes.ACCEPTED))
         duration = broadcast_entry(emit, control, lanes.T1) - broadcast_entry(emit, control, lanes.T0)
@@ -226,7 +226,7 @@ class LaneSteps:
         return None
 
     def accept_or_reject(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Write code that accepts or rejects steps (ACCEPTED = 1 or 0); LONGEST becomes the limit of the next size.
+        """Write code that accepts (ACCEPTED = 1) or rejects steps, and stores LONGEST, the limit of the next step size.
 
         After too many rejections or a value that is not finite, a run leaves its lane: RUNNING = 0.
         """
@@ -375,7 +375,7 @@ class LaneStages:
         return [np.asarray(each).tobytes() for each in self.tableau]
 
     def write(self, emit: LaneEmitter, arguments: tuple[Value, Value, Value], memory: LaneMemory) -> None:
-        """Write code that stores NEW, the state at the time X (s) in the step; ERROR is valid if X is the step size."""
+        """Write code that stores NEW, the state X (s) after the start of the step; ERROR is valid if X is its size."""
         A, b, c, fine_weights, coarse_weights = self.tableau
         _, control, work = arguments
         x, t = emit.load(work, lanes.X), emit.load(work, lanes.T)
@@ -579,7 +579,7 @@ class LaneCode(LaneSteps):
         emit.store(builder.select(is_last, t1, t + h), work, lanes.T_NEW)
 
     def correct_positions(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Write code for a Newton step to C = 0 where ACTIVE = 1; set ACTIVE = UNCONVERGED = 1 if valid, else 0."""
+        """Write code for a Newton step of NEW to C = 0 if ACTIVE = 1; ACTIVE and UNCONVERGED become 1 (valid) or 0."""
         is_active, _ = self._project(
             emit, self.equations.position_projection, lanes.ACTIVE, self.memory(emit, order, control, work)
         )

@@ -422,7 +422,7 @@ class LaneSeries:
     ) -> None:
         """Write code for coefficient k = `order` > 0 of the results of `operations`; `inverse`: 1 / k.
 
-        Coefficient k of the second factor of a PENDING product is not known yet: the term with it is left out.
+        Coefficient k of the second factor of a PENDING product is not known yet: the term that needs it is left out.
         """
         pairs = list(dict.fromkeys(pair for operation in operations for pair in self._factors(operation)))
         sums = {}

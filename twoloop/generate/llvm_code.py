@@ -202,7 +202,7 @@ class Quantities:
         self._sums: dict[tuple[Terms, float], Value] = {}
 
     def define(self, quantity: int, value: Value) -> None:
-        """Define the value of a quantity."""
+        """Set the value of the quantity (an input, or the result of an operation) with this index."""
         self._values[quantity] = value
 
     def value(self, quantity: int) -> Value:
@@ -327,7 +327,7 @@ class Lowering(Algebra[Value]):
         self._computed_quantities = set(locations)
 
     def define(self, quantity: int, value: Value) -> None:
-        """Define the value of a quantity."""
+        """Set the value of the quantity (an input, or the result of an operation) with this index."""
         self._quantities.define(quantity, value)
 
     def define_inputs(self, graph: Graph, arguments: Sequence[Value]) -> None:
@@ -344,7 +344,7 @@ class Lowering(Algebra[Value]):
             first += size
 
     def value(self, quantity: int) -> Value:
-        """Return the value of a quantity."""
+        """Return the value of the quantity with this index."""
         return self._quantities.value(quantity)
 
     def affine(self, expr: Affine) -> Value:
@@ -366,7 +366,7 @@ class Lowering(Algebra[Value]):
         return self._sines_and_cosines[first.key][kind == COSINE]
 
     def run(self, graph: Graph, quantities: Iterable[int], locations: Mapping[int, Location] = NO_LOCATIONS) -> None:
-        """Write code that computes `quantities` in the given order, and stores those that have a memory location."""
+        """Write code that computes `quantities` in the given order, and stores those that are keys of `locations`."""
         if not locations:
             return super().run(graph, quantities)
         for i in quantities:

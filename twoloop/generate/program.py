@@ -61,7 +61,7 @@ class Algebra(Generic[T]):
         return argument if kind == op.SUM else self.functions[kind](argument)
 
     def define(self, quantity: int, value: T) -> None:
-        """Define the value of a quantity."""
+        """Set the value of the quantity (an input, or the result of an operation) with this index."""
         self.values[quantity] = value
 
     def run(self, graph: Graph, quantities: Iterable[int]) -> None:

@@ -611,7 +611,7 @@ class ParameterArrays:
         return self._arrays[id(exprs)][1]
 
     def _numbers_for(self, exprs: Any) -> Array:
-        """Return a new array of numbers for `exprs`: constants, and 0 for Parameters, which `write` evaluates."""
+        """Return a new array of numbers for `exprs`: constants, and 0 for Parameters, whose values `write` adds."""
         entries, begin = exprs.ravel().tolist(), len(self._scales)
         varying = [k for k, entry in enumerate(entries) if type(entry) is Parameter]
         for k in varying:
