@@ -81,7 +81,7 @@ N_SKIPPED_CALLS = 16  # after an exception in a callback, this number of calls d
 STEP_FIELDS = (*STEP_ARRAYS, "stats")  # fields of a result that are computed from the array of steps
 NON_STEP_DEFAULTS = {name: value for name, value in DEFAULTS.items() if name not in STEP_FIELDS}
 SHORT_RUN = 1e-3  # if the last run took less CPU time (s), measure elapsed time instead: reading that clock is faster
-HARMLESS = 0.01  # v0 need not satisfy the constraints exactly: projection may change it by this number of tolerances
+HARMLESS = 0.01  # v0 need not satisfy the constraints exactly: projection may change v0 by this number of tolerances
 REACHED_END = Status.REACHED_END  # a global name is read faster than a member of an Enum
 
 STEPS = OutputRequest()  # request for output at the ends of all steps, without dense output and events
@@ -298,7 +298,7 @@ class CachedIntegrator:
         return self.parametric is None or self.parametric.callbacks_agree(run.t0, q0, v0, t1, mass, derivatives)
 
     def _use_independent_rows(self, rows: bytes) -> None:
-        """Set the run's redundant rows and its warning; `rows`: indices of the independent rows, as bytes."""
+        """Set the run's redundant rows and the warning of these; `rows`: indices of independent rows, as bytes."""
         run = self.run
         run.redundant, run.rows_warning = self.redundancy[rows]
         self.run_fields, self.independent_rows = (run.rank, run.redundant, self.run_fields[-1]), rows

@@ -125,7 +125,7 @@ class Interpolator:
     def reset(self, system: ConstrainedSystem, t0: float, row: Array, pattern: Array) -> None:
         """Reset the interpolator for another run with the same compiled functions (kits).
 
-        `pattern`: matrix with 1 where the constraint rows may be nonzero, else 0.
+        `row`: [q, v, a] at its start t0. `pattern`: matrix with 1 where its constraint rows may be nonzero, else 0.
         """
         self.arguments = (system, t0, row.copy(), *self.arguments[3:])
         self.system, self.may_divide = system, True
@@ -210,7 +210,7 @@ class Interpolator:
         return failures
 
     def _divide_inaccurate_intervals(self, table: StateTable, intervals: Integers) -> None:
-        """Compute and cache interior states for each interval that one polynomial does not interpolate accurately."""
+        """Compute and cache states within each of `intervals` that one polynomial does not interpolate accurately."""
         start_times = table.t[intervals[:, indices.FIRST_OWN]].tolist()
         is_new = np.array([t not in self.accurate_intervals and t not in self.interior_states for t in start_times])
         if not self.may_divide or not is_new.any():
@@ -408,7 +408,7 @@ class Interpolator:
 
 
 def _blocks_of_intervals(rows: Integers) -> list[Integers]:
-    """Divide a table of intervals into blocks so small that the cache can hold the interior states of a block."""
+    """Divide a table of intervals into blocks; the cache can hold all states within the intervals of one block."""
     return [rows[begin : begin + MAX_DIVIDED_INTERVALS] for begin in range(0, len(rows), MAX_DIVIDED_INTERVALS)]
 
 

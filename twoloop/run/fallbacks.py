@@ -94,7 +94,7 @@ def scaled_equations(system: ConstrainedSystem, t: float, q: Array) -> tuple[Arr
     return np.block([[mass, scaled.T], [scaled, np.zeros((len(rows), len(rows)))]]), norms, largest
 
 
-# ratios of the step sizes that are tried in turn across a singular position to the first one. Larger sizes help if a
+# the step sizes tried in turn across a singular position are these ratios times the first size. Larger sizes help if a
 # step ends before the position or too near to it; smaller sizes help if the error of a step is too large
 SIZE_RATIOS = (1.0, *(1.2**k for k in range(1, 12)), *(0.85**k for k in range(1, 28)))
 LARGEST_RATIO = max(SIZE_RATIOS)

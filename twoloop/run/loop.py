@@ -78,7 +78,7 @@ from twoloop.run.singular_positions import TimedState, has_velocity_jump_at_end
 
 Array = NDArray[np.float64]
 
-MAX_STORED_SIGNALS = 3  # number of Ctrl-C signals that are stored; the next one raises, and the result is lost
+MAX_STORED_SIGNALS = 3  # number of Ctrl-C signals that are stored; the next raises KeyboardInterrupt: no result
 
 
 class Interrupts:
@@ -294,7 +294,7 @@ class IntegrationLoop:
             if run.clock[a.SAMPLES_MOTION] == 1.0 and not self.interrupts.n_signals:
                 run.clock[a.SAMPLES_MOTION] = self.control[a.SAMPLE_MOTION] = 0.0
             elif is_crossing and not run.system.called_in_python and not self.interrupts.n_signals:
-                run.clock[a.FAILURE_CODE] = indices.NOT_FINITE  # failed attempt, perhaps at unreachable positions
+                run.clock[a.FAILURE_CODE] = indices.NOT_FINITE  # the attempt failed, perhaps at an unreachable state
             else:
                 self.code, self.callback_error = INTERRUPTED, None if self.interrupts.n_signals else error
                 if not run.system.called_in_python:

@@ -370,7 +370,7 @@ def _describe_stall(run: "Run", t1: float, stall: StallDetector) -> str:
 
 
 def _describe_contradiction(run: "Run") -> str:
-    """Return the message of a run that stopped: a redundant row is violated, or no certain branch leaves its start."""
+    """Return the message of a run that stopped: a redundant row is violated, or the branch at the start is unknown."""
     t, q = float(run.clock[run.a.T]), run.state[: run.system.n_q]
     if run.starts_singular:
         return (

@@ -51,7 +51,7 @@ class Options:
 
     @cached_property
     def metadata(self) -> dict[str, Any]:
-        """Fields `method` and `rtol` of a result; also `untested`, which is None, if all steps test the errors of v."""
+        """Fields `method` and `rtol` of a result; if all steps test the errors of v, also `untested`, which is None."""
         tested = getattr(self.method, "tested", "all")
         return {"method": self.method.name, "rtol": self.rtol} | ({} if tested == "positions" else {"untested": None})
 

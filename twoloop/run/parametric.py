@@ -73,8 +73,8 @@ class SharedSetup:
 class ParametricRun:
     """Run that integrates systems which differ only in parameters, one after another, see `use_parameters_of`.
 
-    `run`: a copy of the run in `shared`, at its start. `current_system`: the system whose parameters the arrays contain
-    now. `system`: a copy of `current_system` that uses these arrays, and has a cache of its own.
+    `run`: copy of the run in `shared`, at its start. `current_system`: system whose parameters the arrays of `run`
+    contain now. `system`: a copy of `current_system` that uses these arrays, and has a cache of its own.
     """
 
     def __init__(self, shared: SharedSetup, run: Run):
@@ -116,7 +116,7 @@ class ParametricRun:
     def callbacks_agree(self, t0: float, q: Array, v: Array, t1: float, mass: Array, with_derivatives: bool) -> bool:
         """Return whether callbacks agree with traces near the start, and M has the same structure as before.
 
-        The structure of M (at the start: `mass`) is whether it is definite, and whether it is diagonal.
+        The structure of M (`mass`: M at the start) is whether M is definite, and whether M is diagonal.
         """
         run, system = self.run, self.system
         if not self._mass_agrees:

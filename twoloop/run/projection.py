@@ -66,7 +66,7 @@ class _SparseProjection:
     def project_nearby(self, q: Array) -> Array | None:
         """Return q projected onto the independent constraints; None on failure, or if other constraints are violated.
 
-        Which rows of C_q are independent is known from the last `RENEW_PARTITION`, at a consistent position: away from
+        Which rows of C_q are independent is known from the last RENEW_PARTITION, at a consistent position: away from
         the constraints, redundant rows are not quite dependent.
         """
         zero, change = np.zeros(len(q)), np.zeros(len(q))
@@ -412,7 +412,7 @@ def _describe_other_assembly(
         if distance(projected, expected) <= MAX_NONLINEARITY * float(np.abs(move).max()) and sign_at(projected) == sign:
             continue
         # the prediction may be inaccurate only because constraints are curved. Then q1 with the dependent coordinates
-        # of `projected` is projected back to q1; if not, `projected` is on another assembly
+        # of `projected` is projected back to q1; otherwise, `projected` is on another assembly
         mixed = q1.copy()
         mixed[dependent_columns] = projected[dependent_columns]
         mixed_projected, excess, _ = _gauss_newton(system, t, mixed, np.array(dependent_columns, dtype=int), cutoff)

@@ -116,7 +116,7 @@ def read_arrays(folder: Path) -> dict[str, NDArray[Any]]:
 
 Array = NDArray[np.float64]
 
-MAX_PENDING_STATES = 1024  # when more states than this are pending, intervals are searched for events, output times
+MAX_PENDING_STATES = 1024  # when more states than this are pending, search intervals for events and output times
 
 
 class OutputRequest(NamedTuple):
@@ -161,7 +161,7 @@ class Recorder:
         max_gap: float,
     ):
         self.request, self.interpolator, self._n_q, self._width = request, interpolator, n_q, len(state)
-        self.n_steps = 0  # number of steps searched for events so far; the last one may contain a terminal event
+        self.n_steps = 0  # number of steps searched for events so far; the last step may contain a terminal event
         self.last_step_size = 0.0  # time (s) from the beginning of the run's last step to the terminal event
         self.interrupted = False  # whether Ctrl-C interrupted the search for events, or the interpolation
         # pending states: ends of intervals not searched for events yet, and earlier states on the same polynomials

@@ -104,7 +104,7 @@ class Run:
         self._reset_clock(t0)
         self.write_step_control(plan)
         self.substituted = False  # whether `plan.substitute` has replaced the first plan
-        self.near_threshold = singular_threshold(rtol)  # near a singular position, pivots of C_q have a lower ratio
+        self.near_threshold = singular_threshold(rtol)  # (smallest / largest pivot) is lower near a singular position
         force_traced = any("force" in each.kinds for each in plan.traced)
         short_and_steep = system.remembered(
             ("changes", force_traced),
@@ -401,7 +401,7 @@ class Run:
     def limit_steps(self) -> None:
         """Limit step sizes so that forces are evaluated at least every hundredth of the run, to detect short forces.
 
-        If forces may be steep, a single evaluation may not detect a short one: then step sizes are at most this time.
+        If forces may be steep, a single evaluation may not detect a short one: then this time also limits step sizes.
         """
         gap = 1.0 if self.forces_may_be_steep else self.plan.max_gap
         max_size = np.inf if self.plan.evaluates_within else self.tolerances[indices.GAP] / gap

@@ -99,7 +99,7 @@ class SampledRun:
         if self.run.start_warning:
             warn_user(self.run.start_warning)
         self.p = system.functions.p[system.called_in_python :]
-        self._force_parameters: set[int] = set()  # indices of parameters that affect forces only, as checks have shown
+        self._force_parameters: set[int] = set()  # indices of parameters that, as checked, affect forces only
         self._parameters_changed = self._step_failed = False
         self._outputs, self._filled = np.zeros(1), np.zeros(2, dtype=np.int64)
         self._buffers = (
@@ -231,7 +231,7 @@ class SampledRun:
         run, a = self.run, self.run.a
         code = entry_point(run.kernels.start)(run.kit, run.work, t, run.state)
         n_not_reset = 0
-        if run.plan.first is not None:  # a pair of methods: keep what chooses between the two
+        if run.plan.first is not None:  # a pair of methods: keep the numbers that choose between these
             from twoloop.kernels.control.stiffness import N_SCALARS
 
             n_not_reset = N_SCALARS + 2 * run.system.n_q

@@ -62,7 +62,7 @@ class SignalHandlers:
     def call_delayed(self) -> None:
         """Call the handlers whose calls were delayed; if a handler has raised an exception, raise it again."""
         while self._delayed_calls and self._handler_error is None:
-            # pass the present frame: with that of the signal, in a compiler, other SignalHandlers would delay the call
+            # pass the present frame: for the signal's frame, in a compiler, other SignalHandlers would delay the call
             self._call_handler(self._delayed_calls.pop(0), sys._getframe())
         if self._handler_error is not None:  # not reset here: `restore` raises it again if the caller catches it
             raise self._handler_error from None

@@ -28,7 +28,7 @@ MAX_SHOWN = 3  # largest number of singular positions in a message
 # displacement of q in finite differences of constraint equations and their Jacobian, relative to the largest coordinate
 DISPLACEMENT = 1e-6
 # each row of the Jacobian is divided by its norm. But a row that is small at this position only is divided by
-# MIN_ROW_NORM times its norm at positions nearby, which is estimated by its derivative
+# MIN_ROW_NORM times the norm that the row has nearby (estimated from the row's derivative)
 MIN_ROW_NORM = 0.1
 # velocities have jumped in a step if their change exceeds JUMP_RATIO * step size * acceleration and MIN_JUMP tolerances
 JUMP_RATIO, MIN_JUMP = 3.0, 10.0
@@ -38,7 +38,7 @@ def describe_crossings(system: ConstrainedSystem, crossings: Crossings, end_stat
     """Return sentences about the singular positions that steps crossed, for the message of a result.
 
     `crossings`: for each position, the states before and after it; if a run ended within a crossing, its last state
-    `end_state` replaces the missing state after it. `rank`: rank of the constraint Jacobian in the rest of the run.
+    `end_state` replaces the missing state after it. `rank`: rank of the constraint Jacobian at other positions.
     """
     ratios = {
         ends[0][0]: _least_ratio_between(system, ends[0], [*ends, end_state][1], rank) for ends in crossings[:MAX_SHOWN]
@@ -130,7 +130,7 @@ def describe_velocity_jump(
 
 def has_velocity_jump_at_end(times: Array, rows: Array, n: int) -> bool:
     """Return True if v jumped in the last step, see JUMP_RATIO; `rows`: states [q, v, a] at `times`; n: size of q."""
-    largest = np.maximum.reduce  # faster than array.max(), because short runs call this function often
+    largest = np.maximum.reduce  # faster than array.max(): short runs call this function often
     if times.size < 2:
         return False
     change = largest(np.abs(rows[-1, n : 2 * n] - rows[-2, n : 2 * n]))

@@ -40,7 +40,7 @@ from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
 
-# to find out if forces depend on a coordinate or velocity x, it is displaced by this number times max(1, |x|)
+# to find out if forces depend on a coordinate or velocity x, x is displaced by this number times max(1, |x|)
 DISPLACEMENT = 1e-3
 # Newton's matrix in implicit steps is factorized as a sparse matrix if at most this fraction of its force derivatives
 # is nonzero, and if this takes at most this fraction of the operations of dense factorization
@@ -257,7 +257,7 @@ def _stiff_rows(
 
 
 def _massless_directions(block: Array) -> Array:
-    """Return the massless directions of a body (rows) for its block of M; all directions if the block is not finite."""
+    """Return the massless directions of a body, as rows, given its block of M; all directions if it is not finite."""
     if not np.isfinite(block).all():
         return np.eye(len(block))
     values, directions = np.linalg.eigh(block)

@@ -61,7 +61,7 @@ FACTOR_AFTER_DIVERGENCE = 0.6  # ratio of the next step size to the size of a st
 SAFETY = 0.75  # safety factor on the step size for which the estimated error would equal the tolerance
 # another method takes over if a counter reaches this: +1 for a step limited by convergence, -1 for others, minimum 0
 MAX_LIMITED = 24.0
-# accelerations hardly vary in a step if their Legendre coefficients of degrees 5 and 6 are below this, in tolerances
+# accelerations hardly vary in a step if the Legendre coefficients of degrees 5 and 6 are below this many tolerances
 MIN_CURVATURE = 0.1
 N_PIVOT_PARTS = 4  # pivots of C_q are checked at 1/4, 1/2 and 3/4 of a step, the ends of this number of equal parts
 MIN_PIVOT_RATIO = 0.4  # another method takes over if a step multiplies the smallest pivot of C_q by less than this
@@ -84,7 +84,7 @@ _array_offsets = merged(array_offsets)
 
 
 def memory_size(n, n_iterated, n_rows):
-    """Return the length of `memory` for n coordinates, with LANES more numbers for the alignment by `_aligned_view`."""
+    """Return the length of `memory`, with LANES more numbers for its alignment; arguments: n_q, N_ITERATED, N_ROWS."""
     return array_offsets(n, n_iterated, n_rows)[-1] + LANES
 
 
@@ -153,7 +153,7 @@ def _solve_collocation(f, w, options, data, tolerances, t, h, state):
         max_factor = min(max_factor, factor_by_defect)
     max_factor = min(max_factor, h_max / h)
     extra_sweeps = data[field.SWEEPS] - data[field.N_TARGET]
-    # the motion may be stiff if accelerations hardly vary, but the step needed as many sweeps as intended, or one less
+    # the motion may be stiff if accelerations hardly vary, but the step needed at least (intended number - 1) sweeps
     is_limited = data[field.CURVATURE] < MIN_CURVATURE and extra_sweeps >= -1.0
     data[field.LIMITED] = max(0.0, data[field.LIMITED] + (1.0 if is_limited else -1.0))
     # `trend`: (step size that the error of this step allows) / (size that the error of the last step allowed). A trend

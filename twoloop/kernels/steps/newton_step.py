@@ -155,7 +155,7 @@ def _filter_errors(f, w, options, memory, h, e_q, e_v):
 
 @compiled
 def _estimate_error(f, w, options, memory, h, tolerances, state, new_state, A_stage):
-    """Return the embedded error estimate of a step, without stiff components: the largest component, in tolerances."""
+    """Return the embedded error estimate of a step (largest component, in tolerances), without stiff components."""
     s, A, _, _, _, _ = tableau_of(options)
     n = w.Q.size
     q, v, a, q1, v1 = state[:n], state[n : 2 * n], state[2 * n : 3 * n], new_state[:n], new_state[n : 2 * n]

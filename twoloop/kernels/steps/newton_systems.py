@@ -78,7 +78,7 @@ EQUAL_STEP_TOLERANCE = 1e-9  # step sizes count as equal up to this relative dif
 # if the last correction is at most this fraction of the smallest tolerance of the run
 MAX_ROUNDING_CORRECTION = 0.1
 
-RELATIVE_DISPLACEMENT = 1e-7  # displacement of q or v in finite differences, relative to `typical_size`
+RELATIVE_DISPLACEMENT = 1e-7  # displacement of a coordinate or velocity in finite differences / its typical size
 # if all coordinates are displaced at once, the displacement of coordinate i is multiplied by
 # 1 + DISPLACEMENT_INCREMENT * (i % N_INCREMENTS): the effects of equal displacements might cancel each other
 DISPLACEMENT_INCREMENT, N_INCREMENTS = 0.37, 7
@@ -102,7 +102,7 @@ def displace_unequally(value, size, index):
 
 @compiled
 def _clear_band(A, b):
-    """Set the entries of A with |i - j| <= b to zero."""
+    """Set the entries of the matrix A with |i - j| <= b (bandwidth) to zero."""
     for i in range(A.shape[0]):
         for j in range(max(0, i - b), min(A.shape[0], i + b + 1)):
             A[i, j] = 0.0
@@ -110,7 +110,7 @@ def _clear_band(A, b):
 
 @compiled
 def _check_band_finite(A, b):
-    """Return DONE, or NOT_FINITE if an entry of A with |i - j| <= b is not finite."""
+    """Return DONE, or NOT_FINITE if an entry of the matrix A with |i - j| <= b (bandwidth) is not finite."""
     for i in range(A.shape[0]):
         for j in range(max(0, i - b), min(A.shape[0], i + b + 1)):
             if not np.isfinite(A[i, j]):

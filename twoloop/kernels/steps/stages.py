@@ -15,7 +15,7 @@ from twoloop.kernels.data.indices import NOT_LOADED
 
 MAX_STEP_RATIO = 3.0  # stages are extrapolated from the last step if (new step size) / (last step size) is at most this
 # Richardson's estimate, which compares a step with two half steps, misses a force that jumps near an end of the step.
-# So the error of a step is estimated as the maximum of this and END_ERROR_WEIGHT * (result of `estimate_end_error`)
+# So the larger one of Richardson's estimate and END_ERROR_WEIGHT * (result of `estimate_end_error`) is used
 END_ERROR_WEIGHT = 0.01
 
 # indices of the scalars in `options` of a method with s stages and the Butcher tableau A, b, c. After the scalars,
@@ -151,7 +151,7 @@ def estimate_end_error(tolerances, options, h, state, new_state, A_stage):
     HAS_PREVIOUS,  # 1: the block PREVIOUS contains the stage accelerations of the last accepted step
     H_PREVIOUS,  # size of the last accepted step (s)
     HAS_JACOBIAN,  # 1: Newton's method may use the stored derivatives of accelerations or forces; 0: compute new ones
-    IS_FRESH,  # 1: the stored derivatives were computed for the stages of this step; 0: for another step, or for an end
+    IS_FRESH,  # 1: the stored derivatives were computed for the stages of this step; 0: for another step, or its end
     PARTITION_NUMBER,  # number of partitions of coordinates (w.generation) when the stored derivatives were computed
     H_FACTORED,  # step size (s) for which the linear systems of Newton's method are factored; 0: no factors are stored
     CONTRACTION,  # ratio of the last correction of Newton's method to the one before

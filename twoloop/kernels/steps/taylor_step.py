@@ -63,8 +63,8 @@ SUM_INDICES = N_SUMS  # seventh array of ROWS and BALANCE: index of the equation
 EARLY, LATE, ROWS = 0, N_TABLE, 2 * N_TABLE
 BALANCE, N_ARRAYS = ROWS + N_SUMS + 1, ROWS + 2 * (N_SUMS + 1)
 # columns of the array GROUPS, which has a row for each group of operations. KIND: kind of operation. BEGIN, END: range
-# of the operations. MORE_FIRST and next column: range of the further terms (indices in MORE_COLUMN) of their first
-# arguments. MORE_SECOND and next column: the same for their second arguments
+# of the operations. MORE_FIRST and next column: range, in MORE_COLUMN, of the further terms of first arguments.
+# MORE_SECOND and next column: range, in MORE_COLUMN, of the further terms of second arguments
 KIND, BEGIN, END, MORE_FIRST, _, MORE_SECOND, _, N_GROUP = range(8)
 
 # indices of the scalars in `memory`. Two Taylor series of q (ORDER + 1, n_q each) and arrays (`array_views`) follow.
@@ -74,7 +74,7 @@ KIND, BEGIN, END, MORE_FIRST, _, MORE_SECOND, _, N_GROUP = range(8)
     CURRENT,  # index (0 or 1) of the stored series about the beginning of the step
     UNIT,  # unit of time (s) of the series about the beginning of the step
     NEXT_UNIT,  # unit of time (s) of the series about the end of the last attempt
-    ALLOWED_SIZE,  # largest size of the step that the series about the beginning of the step allows, in units of UNIT
+    ALLOWED_SIZE,  # largest step size that the series about the beginning of the step allows, in units of UNIT
     NEXT_ALLOWED_SIZE,  # largest step size that the series about the end of the last attempt allows, in NEXT_UNIT
     TRIED,  # 1: the last attempt has computed the series about its end, for the next step if the attempt is accepted
     PASSED,  # time (s) from the state about which the series is computed to the beginning of the step; 0 if KEEP = 0
@@ -382,7 +382,8 @@ def compute_coefficients(f, w, options, memory, t, state, unit):
     return finish_series(w, order, series)
 
 
-TARGET_PREDICTION_ERROR = 0.3  # aim of step sizes: (distance of ends from constraints) / (allowed distance)
+# aim of the step sizes: (distance of the end of a step from the constraints, before projection) / (allowed distance)
+TARGET_PREDICTION_ERROR = 0.3
 # the defect at NEAR_BEGIN, near the beginning of a step, is due to rounding, because the series is exact there. A later
 # defect counts as rounding error if it is at most NOISE_RATIO times this, and at most MAX_NOISE * (allowed defect)
 MAX_NOISE, NOISE_RATIO = 1e4, 10.0
@@ -578,7 +579,7 @@ def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
     distance = prediction_error(w, tolerances, h, q, v, q1)
     memory[DISTANCE_FACTOR], allowed_factor = 1.0, np.inf
     if distance > 0.0:
-        # in a step much shorter than the series allows, x / ALLOWED_SIZE counts as 1 / MAX_GROWTH
+        # if the step is much shorter than the series allows, (step size) / (allowed size) counts as 1 / MAX_GROWTH
         allowed_factor = (TARGET_PREDICTION_ERROR / distance) ** (1.0 / order)
         memory[DISTANCE_FACTOR] = min(1.0, max(x / memory[ALLOWED_SIZE], 1.0 / MAX_GROWTH) * allowed_factor)
     if distance > 1.0:

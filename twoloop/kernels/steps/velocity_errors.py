@@ -76,7 +76,7 @@ def velocity_error(w, tolerances, e_v, duration, state, new_state):
 
 @compiled
 def motion_time(w, tolerances, state, a):
-    """Return the time (s) in which velocities change: max|v_i| / max|a_i|, at most LONGEST_GAPS * tolerances[GAP]."""
+    """Return the time (s) in which velocities change: max|v_i| / max|a_i|, limited as LONGEST_GAPS describes."""
     n = w.Q.size
     largest_v = largest_a = 0.0
     for j in w.independent:
