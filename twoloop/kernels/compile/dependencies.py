@@ -42,7 +42,7 @@ def digest_of(text: str, *sources: str | types.ModuleType) -> str:
     return digest.hexdigest()
 
 
-_DIGEST_TEXTS: WeakKeyDictionary[Dispatcher, str] = WeakKeyDictionary()  # for a callback: text to be hashed instead
+_DIGEST_TEXTS: WeakKeyDictionary[Dispatcher, str] = WeakKeyDictionary()  # texts hashed in place of callbacks
 
 
 def register_digest(callback: Dispatcher, text: str) -> None:
@@ -345,7 +345,7 @@ class FunctionCopier:
         self.copies: dict[Any, Any] = {}  # replacements, by id of the original
 
     def replacement_of(self, value: Any, names: frozenset[str] = frozenset()) -> Any:
-        """Return the replacement of a helper, a tuple, or a user's module (attributes `names` only); else `value`."""
+        """Return the replacement of a helper, a tuple or (only attributes `names`) a user's module; else `value`."""
         if self.is_copied(value):
             if id(value) not in self.copies:
                 self._add_copy(value)

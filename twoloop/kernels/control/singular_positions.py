@@ -20,7 +20,7 @@ SHRINKAGE = 0.8  # size of a step that is repeated again with projected stages, 
 MIN_STEP_NEAR_SINGULAR = 0.001  # shortest useful step near a singular position, relative to the longest recent step
 # if no crossing can be attempted, the run ends when the smallest pivot is below this fraction of its maximum in the run
 UNDETERMINED_PIVOT = 1e-6
-CHECK_INTERVAL = 16  # number of steps between checks of the partition in runs with generated code, which needs none
+CHECK_INTERVAL = 16  # number of steps between checks of the partition, which generated code does not need, in its runs
 # in the augmented form, with n degrees of freedom, the partition is checked every 1 + n // FREEDOMS_PER_CHECK steps,
 # because each check computes the null space of [C_q; A], a dense matrix that steps in this form do not need
 FREEDOMS_PER_CHECK = 32
@@ -30,8 +30,8 @@ MAX_UNCHECKED_PIVOT = 0.5
 # `comes_near_singular` samples the smallest pivot in a step. The pivot may be zero between two samples if one sample is
 # below this fraction of the largest difference of successive samples
 PASSED_PIVOT_RATIO = 0.6
-# MIN_NEAR_RATIO, MAX_NEAR_RATIO: limits of the result of `near_pivot_ratio`. MAX_ROUNDING_ERROR: allowed rounding error
-# near a singular position, in tolerances. EPS: unit roundoff
+# `near_pivot_ratio` returns at least MIN_NEAR_RATIO and at most MAX_NEAR_RATIO. MAX_ROUNDING_ERROR: rounding error, in
+# tolerances, that is allowed near a singular position. EPS: unit roundoff
 MIN_NEAR_RATIO, MAX_NEAR_RATIO, MAX_ROUNDING_ERROR, EPS = 0.02, 0.1, 0.2, 2.0**-53
 MIN_END_RATIO = 0.25  # `ends_near_singular` is True only if the smallest pivot is below this part of clock[PIVOT_HERE]
 

@@ -53,10 +53,10 @@ from twoloop.kernels.linalg.dense import copy
 # the largest rate is first estimated after FIRST_ESTIMATE evaluations of the equations, then every BETWEEN_ESTIMATES;
 # these numbers are multiplied by options[COST_RATIO] while the explicit method is active. An estimate takes about eight
 FIRST_ESTIMATE, BETWEEN_ESTIMATES = 100.0, 600.0
-N_POWER_ITERATIONS = 4  # number of power iterations by dF/dq per estimate (F: accelerations); largest number by dF/dv
+N_POWER_ITERATIONS = 4  # power iterations by dF/dq in an estimate (F: accelerations), and at most this number by dF/dv
 NEGLIGIBLE_DAMPING = 1e-3  # power iterations by dF/dv end early if the eigenvalue times the step size is below this
 ZERO_REPLACEMENT = 1e-3  # replaces zero components of the vector of a power iteration, whose largest component is 1
-STABILITY_LIMIT = 3.0  # a trial begins at any cost if step size * (largest rate) exceeds this times options[LIMIT]
+STABILITY_LIMIT = 3.0  # a trial begins at any cost if step size * (largest rate) / (stability limit) exceeds this
 # if Jacobians are computed by finite differences (about eight evaluations per coordinate), a trial that STABILITY_LIMIT
 # does not require also waits until the run has cost this number of evaluations per independent coordinate
 MIN_COST_PER_COORDINATE = 64.0
@@ -68,10 +68,10 @@ COUNTED_FRACTION_OF_RUN = 0.3  # the cost so far counts as at least this fractio
 COST_OF_ANY_TRIAL = 100.0
 MIN_RATIO_TO_MOTION = 30.0  # above this times `_motion_rate`, the largest rate is "hidden": the motion does not show it
 QUIET_FACTOR = 10.0  # vibrations count as small if their velocities are at most this number of tolerances
-# step size * (largest rate) / options[LIMIT] above which a trial begins if the rate is hidden or of small vibrations
+# a trial begins if step size * (largest rate) / (stability limit) exceeds this, and the rate is hidden or of vibrations
 MIN_HIDDEN_RATIO = 0.05
 DIFFERENCE_STEP = 1e-4  # time step of the finite difference in `_motion_rate`, relative to 1 / (largest rate)
-RETURN_BELOW = 0.4  # the explicit method is tried again if step size * (largest rate) / options[LIMIT] is below this
+RETURN_BELOW = 0.4  # the explicit method is tried again if step size * (largest rate) / (stability limit) is below this
 TRIAL_ERROR_FACTOR = 10.0  # multiplies errors of the implicit method on trial, so that it cannot win by larger errors
 MEAN_WEIGHT = 0.8  # after a step: new mean step size = MEAN_WEIGHT * old mean + (1 - MEAN_WEIGHT) * size of the step
 N_UNMEASURED_STEPS = 5.0  # number of accepted steps at the beginning of a trial that do not count in its cost
@@ -340,7 +340,7 @@ def _phase_to_begin(f, w, options, memory, tolerances, t, state, new_state):
     )
     if is_cheap and h_rho <= 1.0:  # if a trial is not cheap, N_ABOVE_LIMIT is kept, for a trial later
         memory[N_ABOVE_LIMIT] = 0.0
-    is_expensive = cost_per_second > MIN_GAIN * memory[COST_PER_SECOND]  # the explicit method cost less
+    is_expensive = cost_per_second > MIN_GAIN * memory[COST_PER_SECOND]  # more than with the explicit method
     if (memory[PHASE] == EXPLICIT and is_due) or (memory[PHASE] == IMPLICIT and (h_rho < RETURN_BELOW or is_expensive)):
         memory[COST_PER_SECOND] = cost_per_second
         memory[N_TRIALS] += 1.0

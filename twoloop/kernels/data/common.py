@@ -189,12 +189,12 @@ KIT.add_function("attempt_many", MANY)
 # a boolean result return False, and write no results, if the code is not valid at this state, as pivots are too small
 OWN_FUNCTIONS = {
     # functions of a state: arguments (t, q, v, f.numbers), then the arrays of results that the comments name
-    "own_accelerate": types.boolean(f8, VECTOR, VECTOR, VECTOR, VECTOR),  # accelerations
-    "own_correct_positions": types.boolean(f8, VECTOR, VECTOR, VECTOR, VECTOR, VECTOR),  # correction of q, corrected q
-    "own_project": types.boolean(f8, *[VECTOR] * 8),  # accelerations, correction of q, corrected q and v, multipliers
-    "own_redundant": types.boolean(f8, VECTOR, VECTOR, VECTOR, VECTOR),  # nothing; True: redundant rows are satisfied
+    "own_accelerate": types.boolean(f8, VECTOR, VECTOR, VECTOR, VECTOR),  # store accelerations
+    "own_correct_positions": types.boolean(f8, VECTOR, VECTOR, VECTOR, VECTOR, VECTOR),  # store correction of q, new q
+    "own_project": types.boolean(f8, *[VECTOR] * 8),  # store accelerations, correction of q, new q and v, multipliers
+    "own_redundant": types.boolean(f8, VECTOR, VECTOR, VECTOR, VECTOR),  # return True if redundant rows are satisfied
     # functions of collocation steps; `memory` is described in data/collocation.py, `numbers` is f.own_numbers
-    "attempt_nodes": f8(*[VECTOR] * 4),  # (memory, state, tolerances, numbers): solve for stages; code: CONVERGED, ...
+    "attempt_nodes": f8(*[VECTOR] * 4),  # (memory, state, tolerances, numbers): solve for stages; return a code
     "audit_nodes": f8(*[VECTOR] * 3),  # (memory, state, numbers): return the largest defect between nodes; -1: failure
     "retry_nodes": types.none(*[VECTOR] * 2),  # (memory, state): predict a shorter step from a rejected one
     "end_nodes": types.none(*[VECTOR] * 3),  # (memory, state, new_state): compute the state at the end of the step
@@ -437,8 +437,8 @@ def typical_size(tolerances, x):
 def max_change_by_rounding(limit, change, change_q, change_v, size_q, size_v):
     """Return the largest relative change in an iteration that may be due to rounding.
 
-    `change` is the larger one of change_q / size_q and change_v / size_v. Rounding can keep the iteration from going on
-    if changes relative to at least 1 are at most `limit`.
+    `change` is the larger one of change_q / size_q and change_v / size_v. Changes may be due to rounding
+    if, relative to the larger one of size and 1, they are at most `limit`.
     """
     rounded = max(change_q / max(size_q, 1.0), change_v / max(size_v, 1.0))
     return limit * (change / rounded) if rounded > 0.0 else limit

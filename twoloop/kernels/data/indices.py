@@ -135,7 +135,7 @@ WINDOW = 4  # number of accepted states that a polynomial of dense output interp
     KIND,  # kind of the interval: SEPARATE, VELOCITIES, ACCELERATIONS, ACROSS or JUMP
     FIRST_TIME,  # index of the first output time in the interval
     END_TIME,  # 1 + index of the last output time in the interval
-    LOW,  # index of the first state that the polynomial may interpolate: start of the run, or the state after a jump
-    HIGH,  # index of the last state that the polynomial may interpolate: end of the run, or the state before a jump
+    LOW,  # index of the first state that the polynomial may interpolate: start of the run, or state after a jump of v
+    HIGH,  # index of the last state that the polynomial may interpolate: end of the run, or state before a jump of v
     N_COLUMNS,
 ) = range(8)

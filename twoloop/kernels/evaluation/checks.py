@@ -70,7 +70,7 @@ def column_units(matrix, typical, columns, mask, logs, rows, scratch):
     """Store in `columns` (n_q) units of the coordinates in which the entries of C_q (`matrix`) have similar sizes.
 
     The units minimize the sum of log(|entry (i, j)| * unit of coordinate j / unit of row i)^2 over all nonzero entries.
-    This leaves a common factor free, which is chosen so that the median of unit / typical size is 1 (`typical`: n_q
+    A common factor of all units stays free: choose it so that the median of unit / typical size is 1 (`typical`: n_q
     typical sizes of coordinates). Coordinates without nonzero entries get their typical size. Other arguments: scratch.
     """
     n_used, log_factor = 0, 0.0
@@ -406,7 +406,7 @@ def _sum_with_bound(columns, coefficients, constant, nodes, begin, end):
 
 @exact
 def _operation_with_bound(kind, x, bound_x, y, bound_y):
-    """Return the result of an operation (`kind`) on x and y, and its error bound, given the bounds of x and y."""
+    """Return the result of an operation (`kind`) on x and y, and an error bound, given the error bounds of x and y."""
     z = result_of_operation(kind, x, y)
     if kind == op.PRODUCT:
         bound = abs(x) * bound_y + abs(y) * bound_x

@@ -92,7 +92,7 @@ NEGLIGIBLE_DISAGREEMENT = 1e-11
 # weights of values at the times 0, e, 2 e and 4 e in one-sided differences of order 2; COARSE: with the time step 2 e
 ONE_SIDED_WEIGHTS, ONE_SIDED_WEIGHTS_COARSE = (-1.5, 2.0, -0.5, 0.0), (-0.75, 0.0, 1.0, -0.25)
 ONE_SIDED_STEP_RATIO = 1.0 / 16.0  # ratio of the time step of one-sided differences to that of central differences
-# assumed rounding error of Gamma, divided by (largest |G_ij v_j| / largest time step); G: constraint Jacobian
+# assumed rounding error of Gamma, divided by (largest |term G_ij v_j| / largest time step); G: constraint Jacobian
 ROUNDING_OF_TERMS = 1e-14
 CONVERGED_CHANGE = 0.01  # the search for a time step ends if Gamma changes by at most this part of its allowed error
 
@@ -221,7 +221,7 @@ def gamma_by_differences(f, w, t, q, v, first, last):
     if e > 0.0:
         largest, disagreement, terms = _fill_gamma(f, w, t, q, v, e, first, last)
         if np.isnan(largest) or disagreement == 0.0 or w.gamma_scale == 0.0:
-            return DONE  # the caller reports values that are not finite; without a scale, errors cannot be judged yet
+            return DONE  # a NaN, which the caller reports; no error; or no size of Gamma to compare errors with
         rounding = ROUNDING_OF_TERMS * terms / largest_step
         w.gamma_scale = max(w.gamma_scale, largest, rounding / w.gamma_required)
         if disagreement < NEGLIGIBLE_DISAGREEMENT * w.gamma_scale:

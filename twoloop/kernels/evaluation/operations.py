@@ -88,7 +88,7 @@ def _run_program(program, numbers, nodes, t, q, v):
 
 @exact
 def _result_indices(program):
-    """Return how many results a program has, where they begin in `nodes`, and where `program` lists their outputs."""
+    """Return the number of results, the index of the first in `nodes`, and of the list of outputs in `program`."""
     n = program[N_RESULTS]
     return n, program[N_NODES] - n, N_SIZES + N_COLUMNS * program[N_ROWS] + program[N_TERMS]
 

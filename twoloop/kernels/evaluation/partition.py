@@ -346,8 +346,8 @@ def partition_is_poor(w):
 
     The sensitivity to the independent coordinates is max|C_qd^-1 C_qi| (w.D); C_qd and C_qi are the columns of the
     dependent and the independent coordinates in C_q. The sensitivity is near 1 after full pivoting, and grows without
-    bound where the independent coordinates stop being valid. Also return True if `_largest_coefficient` has grown: this
-    happens where independent rows become dependent while the rank stays the same.
+    bound where the independent coordinates stop being valid. Also return True if redundant rows
+    have large coefficients of independent rows, which become dependent there while the rank stays the same.
     """
     largest = 0.0
     for j in range(w.independent_v.size):

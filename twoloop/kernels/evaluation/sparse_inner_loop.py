@@ -184,12 +184,12 @@ def _sine_to_independent_rows(f, w, row, square):
     x, part = w.unknowns, 0.0
     x[:] = 0.0
     rows, columns, _ = jacobian_entries_of(f.ldl_program)
-    for k in range(rows.size):  # set the right-hand side x to [g, 0]
+    for k in range(rows.size):  # set the right-hand side x to [row of G, 0]
         if rows[k] == row:
             x[columns[k]] += w.jacobian_values[k]
     solve_unknowns(f, w, 2)
     rows, columns, _ = mass_entries_of(f.ldl_program)
-    for k in range(rows.size):  # x^T M x is the squared norm of the part of g orthogonal to the independent rows
+    for k in range(rows.size):  # x^T M x: squared norm of the part of the row orthogonal to independent rows
         part += x[rows[k]] * w.mass_values[k] * x[columns[k]]
     return np.sqrt(part / square) if square > 0.0 else 0.0
 
@@ -269,9 +269,9 @@ MAX_SOLUTIONS = 30  # largest number of refinements of the multipliers of least 
 
 @compiled
 def _fill_least_norm_matrix(program, jacobian, n_q, weights, values):
-    """Store [W G^T; G -1], the matrix for multipliers of least norm, in `values`, as `factor` expects it.
+    """Store [W G^T; G -1], the matrix for multipliers of least norm, in `values`, in the order of the `program`.
 
-    `jacobian`: entries of G; W: small diagonal entries, see REGULARIZATION; `weights`: scratch.
+    G: constraint Jacobian with the entries `jacobian`; W: diagonal matrix, see REGULARIZATION; `weights`: scratch.
     """
     rows, columns, slots = jacobian_entries_of(program)
     for j in range(n_q):

@@ -252,10 +252,10 @@ def _pivot_magnitude(work, entry, imaginary, k):
 
 @compiled
 def _choose_pivot(work, matrix, pivots, n, imaginary, c):
-    """In each lane, exchange row c with the row from c on that has the largest entry in column c; invert this pivot.
+    """In each lane, exchange row c and the row (c or later) with the largest entry in column c; invert this pivot.
 
-    Store that row's index in `pivots`. If the pivot is zero, set ACTIVE to 0. If `imaginary` > 0, entries are complex,
-    with imaginary parts `imaginary` vectors after the real parts.
+    Store the latter row's index in `pivots`. If the pivot is zero, set ACTIVE to 0. If `imaginary` > 0, entries are
+    complex, with imaginary parts `imaginary` vectors after the real parts.
     """
     for k in range(LANES):
         best, largest = c, _pivot_magnitude(work, matrix + c * n + c, imaginary, k)

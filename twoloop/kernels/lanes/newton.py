@@ -329,7 +329,7 @@ def _raise_to_largest_value(work, target, begin, n):
 
 @compiled
 def _store_largest_corrections(settings, A, A2, work):
-    """Store the largest changes of q and v due to CHANGES, divided by X^2 and X, in LARGEST_Q and LARGEST_V."""
+    """Store in LARGEST_Q, LARGEST_V the largest changes of q and v by CHANGES, divided by X^2 and X (X: step size)."""
     n = settings[at.N]
     memory = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])[7]
     s = A.shape[0]

@@ -19,7 +19,7 @@ from twoloop.kernels.data.common import INTEGERS, KIT, compiled, kernel, merged
 from twoloop.kernels.lanes import layout as at
 from twoloop.kernels.lanes.layout import CODE, LANES, copy_vectors, fill_field, offsets_in_work
 
-DIAGONAL_SHIFT = 1e-15  # added to the diagonal of G G^T (G: Jacobian with rows of norm 1), so that it is not singular
+DIAGONAL_SHIFT = 1e-15  # added to the diagonal of G G^T, which may be singular (G: Jacobian with rows of norm 1)
 ITERATION_SHIFT = 1e-8  # added to the diagonal of a singular G G^T, to find redundant constraints by inverse iterations
 MAX_REDUNDANT_EIGENVALUE = 1e-4  # up to this eigenvalue, an eigenvector of G G^T counts as a redundant constraint
 N_REDUNDANT_ITERATIONS = 5  # number of inverse iterations per redundant constraint; few suffice for tiny eigenvalues
@@ -72,7 +72,7 @@ def _multiply_vector(work, target, factor):
 def _cholesky(work, pattern, n_rows, n_redundant, row, factors, shift):
     """Store the Cholesky factor of G G^T + shift I + Z^T Z in each lane, with inverted diagonal entries.
 
-    `factors` contains G (Jacobian, rows of norm 1), Z (vanishing combinations of rows) and the result. `row` (n): zero.
+    `factors` contains G (Jacobian, rows of norm 1), Z (vanishing combinations of rows) and the result. `row`: n zeros.
     """
     n_entries = pattern[n_rows] - pattern[0]
     gram = factors + n_entries + n_rows
