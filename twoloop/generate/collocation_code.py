@@ -135,7 +135,7 @@ TARGET_SWEEPS = 6.0  # number of sweeps (iterations) in which a step should conv
 EXTRA_SWEEPS = 7  # a step is rejected if it has not converged after the target number of sweeps and this number more
 MAX_CONTRACTION = 0.8  # if changes by successive sweeps have at least this ratio in sweep 4 or later, reject the step
 MIN_RHO, MAX_RHO = 1e-3, 0.9  # the ratio rho of changes by successive sweeps is clipped to these bounds
-FAST_START, SLOW_START = 0.04, 0.3  # a guessed first step size is changed if rho of sweep 2 is outside these bounds
+FAST_START, SLOW_START = 0.04, 0.3  # a guessed step size is kept if (change by sweep 2) / (by sweep 1) is in between
 STAGNATION_RATIO = 0.5  # sweeps also end if a change may be a rounding error, and is at least this * the change before
 # with steps of fixed size, sweeps (iterations) end if the error of the iteration is at most KAPPA_OF_FIXED * tolerance,
 # if changes are below ROUNDING_OF_FIXED * |v| (v: velocities) and decay no more, or after MAX_SWEEPS_OF_FIXED

@@ -91,10 +91,10 @@ def _store_if_valid(emit: Emitter, is_valid: Value, pointers: Sequence[Value], a
 def call_accelerations(
     emit: Emitter, equations: Elimination, index: int, inputs: Sequence[Value], numbers: Coefficients, out: Value
 ) -> Value:
-    """Write a call of a function that stores the accelerations at `inputs`, [t, q, v], in `out`; return its flag.
+    """Write a call of a function that stores accelerations at `inputs`, [t, q, v], in `out`; return a flag: 1 if valid.
 
-    The flag is 1 if the accelerations are valid. `index`: 0 for the program with the fewest operations, -1 for the
-    elimination that begins with M. `numbers`: the coefficients and their indices in an array.
+    `index`: 0 for the program with the fewest operations, -1 for the elimination that begins with M. `numbers`: the
+    coefficients and their indices in an array.
     """
     state = _stack_array(emit, 2 * equations.system.n_q)
     for i, value in enumerate(inputs[1:]):

@@ -48,8 +48,8 @@ Array = NDArray[np.float64]
 
 SINGULAR_MASS = 1e-10  # M is singular if its smallest eigenvalue is below this fraction of its largest eigenvalue
 RANK_TOL = 1e-9  # a row g of G depends on others if the norm of its part orthogonal to them is below this * norm of g
-# the relative pivot of a row of G is its pivot / the pivot that the row would have if G had no other rows. Generated
-# code is invalid below a limit of relative pivots: about this fraction of the smallest relative pivot at the start
+# the relative pivot of a row of G is its pivot / the pivot that it would have if G had no other rows. Results are
+# invalid if a relative pivot is below a limit, which is about this fraction of the smallest relative pivot at the start
 PIVOT_FRACTION = 0.01
 MIN_PIVOTS = 10.0 ** np.arange(-2, -9, -1)  # possible limits of relative pivots; below these, rounding errors dominate
 # let p be the smallest relative pivot at the start. The limit of relative pivots during the run is MIN_PIVOTS[i] for
@@ -308,7 +308,7 @@ class Elimination:
     def __init__(self, system: ConstrainedSystem, choice: PivotChoice, equations: Equations | None = None):
         self.equations = Equations(system) if equations is None else equations
         self.system, self.choice, self.graph = system, choice, self.equations.graph
-        self.zero, self._n_reduced = Affine(self.graph, 0.0, {}), 0  # _n_reduced: operations only for `reduced_program`
+        self.zero, self._n_reduced = Affine(self.graph, 0.0, {}), 0  # _n_reduced: number recorded for `reduced_program`
         n, (self.q, self.v) = system.n_q, (self.equations.q, self.equations.v)
         self.mass = self._callback_terms("mass")
         rows = [self._callback_terms("jacobian"), self._callback_terms("nonholonomic")]

@@ -290,7 +290,7 @@ class LaneSeries:
             emit.store(quantities.sum(*expr), scratch, self.rhs_offset + index)
 
     def write_order(self, emit: LaneEmitter, k: Value, unit: Value, out: Value, scratch: Value) -> None:
-        """Write code that stores coefficient k + 1 of q in `out`, and coefficients k > 0 of all factors in `scratch`.
+        """Write code that stores Taylor coefficient k + 1 of q in `out`, and k > 0 of all factors in `scratch`.
 
         `unit`: unit of time of the series (s). The code first solves for coefficient k - 1 of the accelerations.
         """
@@ -323,7 +323,7 @@ class LaneSeries:
         solution = self.solution
         _, (a, lam) = lower_program(emit, solution.solution_program, [*r, *c, *stored], self.numbers)
         per_v, per_q = unit * per_order, unit / emit.to_double(next_order)
-        previous = Quantities(emit, lambda i: zero)  # coefficient k - 1 of a and lam; 0 for other quantities
+        previous = Quantities(emit, lambda i: zero)  # Taylor coefficient k - 1 of a and lam; 0 for other quantities
         for j in range(n):
             v = per_v * a[j]
             quantities.define(1 + n + j, v)
@@ -345,7 +345,7 @@ class LaneSeries:
     def _write_order_0(
         self, emit: LaneEmitter, quantities: Quantities, operations: list[Operation], row: "_Row", scratch: Value
     ) -> None:
-        """Write code for coefficient 0 of the results of `operations`; store coefficient 0 of factors in `row`."""
+        """Write code for Taylor coefficient 0 of the results of `operations`; store that of factors in `row`."""
         one, zero = emit.constant(1.0), emit.constant(0.0)
         for operation in operations:
             kind, results, first, second = operation
@@ -420,7 +420,7 @@ class LaneSeries:
         order: Value,
         inverse: Value,
     ) -> None:
-        """Write code for coefficient k = `order` > 0 of the results of `operations`; `inverse`: 1 / k.
+        """Write code for Taylor coefficient k = `order` > 0 of the results of `operations`; `inverse`: 1 / k.
 
         Coefficient k of the second factor of a PENDING product is not known yet: the term that needs it is left out.
         """
@@ -490,10 +490,10 @@ class _Row:
 class _PartialSums(NamedTuple):
     """Sums of X[j] Y[k - j] over 1 < j < k, and the rows from which to add the missing terms for j = 1 and j = k."""
 
-    sums: dict[tuple[tuple[int, int], bool], Value]  # keys: (indices of factors X and Y, whether it is for order k + 1)
-    first_row: Value  # pointer to the row of order 1; if k is 1, to a row of zeros, so that products are 0
-    row_1: Value  # pointer to the row of order 1
-    row_before: _Row  # row of order k - 1
+    sums: dict[tuple[tuple[int, int], bool], Value]  # keys: (indices of factors X and Y, True for order k + 1)
+    first_row: Value  # pointer to `row_1`; if k is 1, to a row of zeros, so that products with it are 0
+    row_1: Value  # pointer to the row that contains coefficient 1 of each factor
+    row_before: _Row  # row that contains coefficient k - 1 of each factor
 
     def sum_of_order(self, pair: tuple[int, int]) -> Value:
         """Return the sum of X[j] Y[k - j] over 0 < j < k; `pair`: indices of the factors X and Y."""

@@ -202,7 +202,7 @@ class ReductionFailed(Exception):
 
 
 class DependentCoordinates:
-    """Solution a = g + T a_i of G a = gamma: all accelerations a, given the independent ones, a_i.
+    """Solution a = g + T a_i of G a = gamma: a vector g and a matrix T yield accelerations a from the independent a_i.
 
     rows : the matrix G; its rows are independent.
     blocks : rows and columns of the pivots, in the order of elimination. The columns are the dependent coordinates.
@@ -314,7 +314,7 @@ class DependentCoordinates:
 def solve_reduced_system(
     mass: Any, force: Sequence[Affine], coordinates: DependentCoordinates
 ) -> tuple[list[Affine], list[tuple[Affine, Affine]]]:
-    """Return the accelerations a (n_q,), given M (`mass`), Q (`force`) and the solution a = g + T a_i of constraints.
+    """Return the accelerations a = g + T a_i (`coordinates`: T, g), where T^T M T a_i = T^T (Q - M g); `force`: Q.
 
     Also return pairs of expressions. If the first is larger than the second in each pair, T^T M T is not singular.
     """

@@ -39,7 +39,7 @@ MAX_ENTRIES = 20_000  # about the largest number of entries that are compared: f
 # differences of call and trace are compared with the largest term that the trace adds up in any entry of the result
 ROUNDING_DIFFERENCE = 16.0 * np.finfo(float).eps  # a difference up to this * the largest term is a rounding error
 CLEAR_DIFFERENCE = 1e-6  # the trace is wrong if a difference is above this * the largest term, or is systematic
-# `_is_systematic` compares call and trace at N_NEIGHBOURS states, whose relative distance is at most PERTURBATION
+# `_is_systematic` compares call and trace at N_NEIGHBOURS states, at most PERTURBATION (relative) from a given state
 PERTURBATION, N_NEIGHBOURS = 1e-7, 12
 MARGIN = 0.01  # a CheckedRegion extends the range of each entry of checked states [t, q, v] by this * (max - min)
 MARGIN_AT_REST = 1e-9  # all ranges are also extended by this * the largest range of q and v: at rest, a range is 0
