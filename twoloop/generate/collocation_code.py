@@ -690,7 +690,7 @@ class CollocationCode:
         store_lanes(emit, emit.builder.select(is_valid, before, emit.constant(0.0)), work, mem.VALID)
 
     def _integrate(self, emit: LaneEmitter, work: Value, state: Value) -> Value:
-        """Write code that integrates accelerations to new v and q; return the largest |change of v| / tolerance."""
+        """Write code that integrates accelerations to v, q at nodes; return the largest |change of v| / tolerance."""
         num = Emitter(emit.builder)
         with loop_over_coordinates(emit, self.iterated_coordinates, [emit.constant(0.0)]) as (k, i, (largest,), new):
             before = load_lanes(emit, num.pointer(work, k * LANES), self.v_offset)

@@ -250,7 +250,7 @@ class SplitFunctions:
         return lowering
 
     def _write_factors(self, emit: Emitter, *arguments: Value) -> Value:
-        """Write the part "factors", which fills the array `arguments[4]`; return a flag: 1 if pivots are not small."""
+        """Write the part "factors", which stores factors in `arguments[4]`; return a flag: 1 if no pivot is small."""
         graph, solution, stored = self.equations.graph, self.solution, arguments[4]
         lowering = self._lowering(emit, graph, arguments, {})
         locations = {i: (stored, index) for i, index in solution.stored_indices.items()}

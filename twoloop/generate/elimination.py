@@ -227,7 +227,7 @@ class PivotChooser:
         return replace(stiffened, min_pivot=float(MIN_PIVOTS[new_index]))
 
     def _stored_choice(self, index: int) -> PivotChoice:
-        """Return the choice that the compiled search stored; raise Untraceable if its result `index` is negative."""
+        """Return the choice that the compiled search stored; raise Untraceable if the search failed (`index` < 0)."""
         from twoloop.kernels.linalg.rank import STAYS_SINGULAR
 
         system, n_rows = self.system, self.system.n_c + self.system.n_a
@@ -388,7 +388,7 @@ class Elimination:
 
     @cached_property
     def reduced_program(self) -> Program | None:
-        """Return a shorter program for accelerations, which eliminates dependent coordinates; None: too little gain."""
+        """Return a shorter program for accelerations: it eliminates dependent coordinates. None if it saves little."""
         blocks = self.choice.blocks
         if not blocks:
             return None

@@ -50,7 +50,7 @@ from twoloop.problem.system import ConstrainedSystem
 # if a Taylor step is rejected because the projection changes q by more than a limit, the next step is so much shorter
 # that its projection is expected to change q by this * the limit (the same as in kernels/steps/taylor_step.py)
 TARGET_ERROR = 0.3
-MIN_FACTOR, SAFETY, MAX_FACTOR = 0.1, 0.9, 5.0  # smallest ratio of successive step sizes, safety factor, largest ratio
+MIN_FACTOR, SAFETY, MAX_FACTOR = 0.1, 0.9, 5.0  # limits of (step size / last step size); SAFETY: factor on this ratio
 MAX_REJECTIONS = 10  # a run with more successive rejected steps than this is repeated outside the lanes
 FIRST_UNIT = 0.01  # unit of time of the first series of a run, relative to the duration t1 - t0 of the run
 # a projection has converged if it changes q by at most ABSOLUTE_CORRECTION (unit of q) or RELATIVE_CORRECTION * max|q|
@@ -375,7 +375,7 @@ class LaneStages:
         return [np.asarray(each).tobytes() for each in self.tableau]
 
     def write(self, emit: LaneEmitter, arguments: tuple[Value, Value, Value], memory: LaneMemory) -> None:
-        """Write code that stores NEW, the state X (s) after the start of the step; ERROR is valid if X is its size."""
+        """Write code that stores NEW, the state X (s) after a step began, and ERROR, valid at the end of the step."""
         A, b, c, fine_weights, coarse_weights = self.tableau
         _, control, work = arguments
         x, t = emit.load(work, lanes.X), emit.load(work, lanes.T)

@@ -55,7 +55,7 @@ class SymbolicObject:
     """Base class of Graph and ParameterTape, which record the operations of a callback while it is traced.
 
     is_tracing : whether a callback is being traced with symbols or Parameters of this record.
-    refusal_reason : why the callback cannot be traced; "": no reason so far. Stored, as callbacks may catch exceptions.
+    refusal_reason : why the callback cannot be traced, stored because callbacks may catch exceptions; "": no reason.
     """
 
     is_tracing, refusal_reason = False, ""

@@ -82,7 +82,7 @@ class SeriesProgram:
 
     @property
     def n_operations(self) -> int:
-        """Return the number of operations, including the products of G v and G^T lam + M a."""
+        """Return the number of operations, including the products in G v and G^T lam + M a."""
         return len(self.early.first.column) + len(self.late.first.column)
 
     def specialize(self, system: ConstrainedSystem, evaluate: Evaluator) -> "SeriesProgram":

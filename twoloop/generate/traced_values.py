@@ -42,7 +42,7 @@ CLEAR_DIFFERENCE = 1e-6  # the trace is wrong if a difference is above this * th
 # `_is_systematic` compares call and trace at N_NEIGHBOURS states, at most PERTURBATION (relative) from a given state
 PERTURBATION, N_NEIGHBOURS = 1e-7, 12
 MARGIN = 0.01  # a CheckedRegion extends the range of each entry of checked states [t, q, v] by this * (max - min)
-MARGIN_AT_REST = 1e-9  # all ranges are also extended by this * the largest range of q and v: at rest, a range is 0
+MARGIN_AT_REST = 1e-9  # ranges of checked states are also extended by this * the largest range: ranges at rest are 0
 
 
 class CallbackTraces:
