@@ -435,7 +435,7 @@ def arrays_of(
 
 
 def _choice_as_array(choice: PivotChoice | None) -> tuple[NDArray[np.int64], float]:
-    """Return the pivots that generated code uses, as an array of integers for kernels, and a factor s.
+    """Return the pivots of generated code, as an array of integers for kernels, and the factor s of terms added to M.
 
     The array is empty if `choice` is None. If M is singular, the code adds s g^T g to M for some constraint rows g: so
     M becomes definite. If nothing is added, s is 1.

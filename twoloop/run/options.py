@@ -62,7 +62,7 @@ class Options:
             run.set_step_sizes(self.first_step, self.max_step, t1)
 
 
-NO_CALL: Any = (None,) * 12, None  # in place of the stored (12 arguments, options) of the last call if there was none
+NO_CALL: Any = (None,) * 12, None  # before the first call, in place of (12 arguments, options) of the last call
 
 
 def options_of(

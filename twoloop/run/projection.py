@@ -191,7 +191,7 @@ CONVERGED_VIOLATION = 1e-2
 RANK_CUTOFF, LSTSQ_CUTOFF, REDUNDANT_CUTOFF = 1e-10, 1e-13, 1e-2
 # a dead centre is near if the ratio of the smallest to the largest singular value of C_q is at most this
 DEAD_CENTRE_RATIO = 0.01
-MAX_EQUAL_DISTANCE = 0.1  # projected guesses are equal if (distance) / (largest change by projection) is at most this
+MAX_EQUAL_DISTANCE = 0.1  # two projected guesses are equal if distance / (largest change by projection) is at most this
 MAX_CHANGE = 1e8  # the iteration has diverged if a coordinate changes by more than this, in its unit (`Scales.columns`)
 
 
@@ -490,7 +490,7 @@ def _identify_assembly(scaled: Array, free: NDArray[np.intp]) -> tuple[tuple[int
 
 
 def _weakest_direction(scaled: Array, free: NDArray[np.intp]) -> Array:
-    """Return the right singular vector (n_q,) of the smallest nonzero singular value of the scaled C_q; max|x| = 1."""
+    """Return the right singular vector x of the smallest nonzero singular value of the scaled C_q, with max|x| = 1."""
     values, rows = np.linalg.svd(scaled[:, free], full_matrices=False)[1:]
     nonzero = values > RANK_CUTOFF * values.max()
     direction = np.zeros(scaled.shape[1])

@@ -52,7 +52,7 @@ CONTRADICTION = 1e-6
 
 
 class Run:
-    """Data of an integration: plan (method), kit, workspace, state and controls; at first at the start of the run.
+    """Data of an integration: plan (method), kit, workspace, state and controls. A new Run is at its start.
 
     Raise ValueError if accelerations at the start cannot be computed, or if constraints contradict one another.
     """

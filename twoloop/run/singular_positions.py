@@ -30,7 +30,7 @@ DISPLACEMENT = 1e-6
 # each row of the Jacobian is divided by its norm. But a row that is small at this position only is divided by
 # MIN_ROW_NORM times the norm that the row has nearby (estimated from the row's derivative)
 MIN_ROW_NORM = 0.1
-# velocities have jumped in a step if their change exceeds JUMP_RATIO * step size * acceleration and MIN_JUMP tolerances
+# velocities jumped in a step if their change exceeds both JUMP_RATIO * step size * acceleration and MIN_JUMP tolerances
 JUMP_RATIO, MIN_JUMP = 3.0, 10.0
 
 
@@ -164,10 +164,10 @@ def _largest_acceleration(system: ConstrainedSystem, t: float, q: Array, v: Arra
 
 
 def scaled_to_unit_masses(system: ConstrainedSystem, t: float, q: Array) -> tuple[Array, Array, Array, Array]:
-    """Return M and the constraint Jacobian for scaled coordinates and rows, the divisors of rows, and the units.
+    """Return M and the constraint Jacobian, both scaled, the divisors of rows, and the units of coordinates.
 
-    The units (of coordinate j: 1 / sqrt(M_jj)) make the diagonal entries of M 1. With the divisors, all rows of the
-    Jacobian have the norm 1, except for rows that are small at this position only, see MIN_ROW_NORM.
+    q_j is scaled as q_j / unit_j with unit_j = 1 / sqrt(M_jj), so that the diagonal entries of M become 1. With the
+    divisors, all rows of the Jacobian have the norm 1, except for rows that are small at this position only.
     """
     mass, rows = system.mass(t, q), system.rows(t, q)
     inertia = np.abs(np.diagonal(mass))

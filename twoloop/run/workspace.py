@@ -202,7 +202,7 @@ def _create_fixed_order_form(system: ConstrainedSystem, t0: float, q0: Array) ->
 
 
 def _coordinates_of_bodies(system: ConstrainedSystem, mass: Entries) -> list[tuple[int, ...]]:
-    """Return a tuple of coordinates for each body that is known.
+    """Return for each known body the tuple of its coordinates (indices).
 
     The joints of the system name one body each, so that bodies at the ends of chains may be missing. If all bodies have
     seven coordinates (position and Euler parameters), no body is missing.

@@ -94,8 +94,8 @@ def largest_error(tolerances, y, y1, fine_error, coarse_error, strict):
 
     Let e and d be the largest components of `fine_error` and `coarse_error` (2 n each), relative to atol + rtol |y|.
     The result is e^2 / sqrt(e^2 + d^2); if `strict` (near a singular position, where terms of high order are not
-    small), e^(3/2) / (e^2 + d^2)^(1/4). Single components have no such result: where a coarse estimate passes through
-    zero, the result would be e, which is of low order, and steps would need up to 30 % more evaluations.
+    small), e^(3/2) / (e^2 + d^2)^(1/4). The formula is not applied to single components: where a coarse estimate is
+    zero by chance, the result would be e, which is of low order, and steps would need up to 30 % more evaluations.
     """
     n = fine_error.size // 2
     rtol = tolerances[RTOL]

@@ -141,7 +141,7 @@ def _solve_stages(f, w, options, memory, t, h, tolerances, q, v, A_stage):
 
 @compiled
 def _filter_errors(f, w, options, memory, h, e_q, e_v):
-    """Remove stiff components of error estimates: replace (e_q, e_v) by (I - z J)^-1 (e_q, e_v).
+    """Remove stiff components of the error estimates (e_q, e_v): multiply these by (I - z J)^-1, with the Jacobian J.
 
     J: derivative of (v_i, a_i) by (q_i, v_i). z: step size h times the constant GAMMA0 of the method. The estimates are
     the first n_dof entries of the vectors e_q and e_v (n_q each); the other entries are scratch.

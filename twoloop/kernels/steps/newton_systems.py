@@ -78,7 +78,7 @@ EQUAL_STEP_TOLERANCE = 1e-9  # step sizes count as equal up to this relative dif
 # if the last correction is at most this fraction of the smallest tolerance of the run
 MAX_ROUNDING_CORRECTION = 0.1
 
-RELATIVE_DISPLACEMENT = 1e-7  # displacement of a coordinate or velocity in finite differences / its typical size
+RELATIVE_DISPLACEMENT = 1e-7  # (displacement of a coordinate or velocity in finite differences) / (typical size)
 # if all coordinates are displaced at once, the displacement of coordinate i is multiplied by
 # 1 + DISPLACEMENT_INCREMENT * (i % N_INCREMENTS): the effects of equal displacements might cancel each other
 DISPLACEMENT_INCREMENT, N_INCREMENTS = 0.37, 7
@@ -158,9 +158,9 @@ def _subtract_reaction_tangent(f, w, tolerances, t, q, moved, b, K):
 
 @compiled
 def fill_tangent_by_q(f, w, tolerances, t, q, v, b, moved, K, R):
-    """Store the entries of d(Q - C_q^T lam)/dq at (t, q, v) with |i - j| <= b in K (n_q, n_q); return a code.
+    """Store K (n_q, n_q), the derivative of the forces with reactions, Q - C_q^T lam, by q; only for |i - j| <= b.
 
-    The last evaluation must have been at (t, q, v). `moved` (n_q) and R (n_q, n_q) are scratch.
+    Return a code. The last evaluation must have been at (t, q, v). `moved` (n_q) and R (n_q, n_q) are scratch.
     """
     _clear_band(K, b)
     f.force_by_q(t, q, v, f.p, K)
@@ -177,7 +177,7 @@ def fill_tangent_by_q(f, w, tolerances, t, q, v, b, moved, K, R):
 
 @compiled
 def fill_tangent_by_v(f, t, q, v, b, D):
-    """Store the entries of dQ/dv with |i - j| <= b in D (n_q, n_q), if the system provides dQ/dv; return a code."""
+    """Store the entries of dQ/dv (Q: forces) with |i - j| <= b in D (n_q, n_q), if dQ/dv is given; return a code."""
     if f.force_by_v_given == 0:
         return DONE
     _clear_band(D, b)
@@ -340,10 +340,10 @@ def _band_view(numbers, n, b):
 
 @inlined
 def _border_views(w, n, r, b):
-    """Return views of copies made with K: independent rows of C_q (r, n); w.D; indices (r) of dependent coordinates.
+    """Return views of copies made with K: independent rows of C_q (r, n), derivative of dependent velocities, indices.
 
-    w.D (n - r + 1, r) is the derivative of dependent by independent velocities, transposed; its last row contains the
-    velocities due to drives. The copies are stored behind the band of K.
+    w.D (n - r + 1, r): derivative by independent velocities, transposed; its last row contains the velocities due to
+    drives. The indices (r) are those of dependent coordinates. The copies are stored behind the band of K.
     """
     numbers = matrix_storage(w, n, at.DERIVATIVE_Q)
     start = n * (2 * b + 1)
@@ -592,7 +592,7 @@ def _sparse_factor_view(f, w, k):
 
 @compiled
 def _fill_sparse_residual(f, w, t, q, v, renews_G, out):
-    """Store the residual Q - G^T w.lam at (t, q, v) in `out` (n_q); return the largest absolute term of this sum.
+    """Store the forces with reactions, Q - G^T w.lam, at (t, q, v) in `out` (n_q); return the largest |term|.
 
     The entries of G are in w.jacobian_values; if `renews_G`, evaluate them at (t, q) first.
     """
@@ -850,10 +850,10 @@ def solve_system(f, w, options, memory, s, k, x):
 
 @compiled
 def filter_error(f, w, options, memory, s, h, e_q, e_v):
-    """Remove stiff components from e_v: replace it by (I - z^2 J_q - z J_v)^-1 (e_v + z J_q e_q), with z = h gamma0.
+    """Remove stiff components from the velocity error e_v: e_v = (I - z^2 J_q - z J_v)^-1 (e_v + z J_q e_q).
 
-    J_q, J_v: derivatives of accelerations by q_i and v_i. gamma0: a constant of the method, see GAMMA0. The estimated
-    errors of q and v are the first n_dof entries of e_q and e_v (n_q each); the other entries are scratch.
+    z: step size h times GAMMA0. J_q, J_v: derivatives of accelerations by q_i and v_i. The estimated errors of q and v
+    are the first n_dof entries of e_q and e_v (n_q each); the other entries are scratch.
     """
     m = w.independent.size
     if f.form == FIXED_ORDER:

@@ -180,7 +180,7 @@ DERIVATIVE_Q, DERIVATIVE_V, FILTER, SYSTEMS = range(4)
 def newton_options(
     A: NDArray[np.float64], b: NDArray[np.float64], c: NDArray[np.float64], tests_velocities: bool
 ) -> NDArray[np.float64]:
-    """Return the numbers that Newton's method needs at the end of `options`: eigenvalues and eigenvectors of A etc.
+    """Return the part of `options` for Newton's method: eigenvalues and eigenvectors of the tableau's A, and others.
 
     A, b, c: Butcher tableau; A must be diagonalizable. `tests_velocities`: value of TESTS_VELOCITIES. See N_REAL.
     """
@@ -197,7 +197,7 @@ def newton_options(
 
 
 def _error_weights(b: NDArray[np.float64], c: NDArray[np.float64], gamma0: float) -> NDArray[np.float64]:
-    """Return the weights e (s) of the error estimate h (gamma0 f(y_n) + sum_j e_j f(Y_j)).
+    """Return the weights e (s) of the embedded error estimate h (gamma0 f(y_n) + sum_j e_j f(Y_j)) of a step.
 
     f: right-hand side of y' = f(y). y_n: state at the beginning of the step. Y_j: stages. The estimate is the
     difference between an embedded quadrature of order s and the method with weights b and nodes c (Hairer & Wanner II,

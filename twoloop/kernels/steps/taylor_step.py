@@ -271,7 +271,7 @@ def _fill_second_factors(options, table, values, y):
 
 @inlined
 def array_views(options, memory, n, n_rows):
-    """Return nine views of `memory`: N, X1, Y1, X2, Y2, total1, total2, r, c.
+    """Return nine views of `memory` for computing a Taylor series: N, X1, Y1, X2, Y2, total1, total2, r and c.
 
     Row k of N has the Taylor coefficients of order k of all quantities. X1, Y1: series x and y of the operations EARLY,
     see `start_operations`; total1: sums of products of their coefficients. X2, Y2, total2: the same for LATE. r (n) and
