@@ -398,7 +398,7 @@ class Interpolator:
             failures = fill(self.kit, self.work, times, states, out)
         self.failures, n = failures, self.system.n_q
         if failures > 0:
-            # at a start in a singular position, store the known accelerations; multipliers stay NaN (the run has warned)
+            # at a start in a singular position, store the known accelerations; multipliers stay NaN (the run warned)
             is_missing = np.isnan(out[:, :n]).any(axis=1)
             out[is_missing & (times == self.arguments[1]), :n] = self.arguments[2][2 * n :]
             n_missing = int(np.isnan(out[:, :n]).any(axis=1).sum())
