@@ -97,7 +97,7 @@ def _allocate_workspace(sizes: Sizes) -> Work:
 
 
 def keep_unused_workspace(work: Work) -> None:
-    """Keep a workspace for later runs unless it is large; above MAX_UNUSED, discard those of sizes used longest ago."""
+    """Keep a workspace for later runs unless it is large; above MAX_UNUSED, discard workspaces of the oldest sizes."""
     unused = _unused_workspaces.pop(work.sizes, [])
     if work.notes.base.size <= MAX_UNUSED_SIZE and len(unused) < MAX_UNUSED:
         unused.append(work)
@@ -129,7 +129,7 @@ def cached_run() -> Any:
 
 
 def _fixed_order_shapes(n_q: int, n_c: int, rank: int, form: FixedOrderSizes) -> tuple[dict[str, tuple[int, ...]], ...]:
-    """Return the shapes of the arrays whose shapes differ in the fixed-order form: of floats, and of integers.
+    """Return the shapes of float arrays, and of integer arrays, that have other shapes in the fixed-order form.
 
     The fixed-order form has no partition: all coordinates count as independent, and also as dependent, because steps
     compare all predicted positions with the positions on the constraints.

@@ -157,7 +157,7 @@ def locate_discontinuity(f, w, t, end, q, v, velocity, tolerances):
 
 
 N_SAMPLES = 20  # number of time intervals between the 21 samples of one set
-MIN_TIME_AHEAD = 12.0  # samples along the motion extend at least over this number times control[SPACING], in s
+MIN_TIME_AHEAD = 12.0  # samples along the motion extend at least over this number times control[SPACING] (s)
 SUDDEN_RATIO = 0.1  # a change is sudden if the second difference exceeds this fraction of the range of the samples
 # a force, C_t or b counts as constant if its samples differ by at most LEAST_RANGE * rtol times the largest value so
 # far, or by at most LEAST_VALUE, as squares of smaller numbers underflow
@@ -428,7 +428,7 @@ def _sample_ahead(f, w, tolerances, control, clock, next_change, t, size, last, 
     if may_resample and max_spacing < RESAMPLE_BELOW * clock[at.SAMPLED_EVERY]:
         clock[at.SAMPLED_TO] = t
     begin = max(t, clock[at.SAMPLED_TO])
-    is_at_change = clock[at.DISCONTINUITY] == clock[at.SAMPLED_TO]  # at a change, sample as closely as before it
+    is_at_change = clock[at.DISCONTINUITY] == clock[at.SAMPLED_TO]  # at a change, sample as closely as before
     while begin < min(t + size, last, next_change):
         spacing, is_at_change = min(max_spacing, clock[at.SAMPLED_EVERY]) if is_at_change else max_spacing, False
         clock[at.WIDEST_SAMPLING] = max(clock[at.WIDEST_SAMPLING], spacing)

@@ -37,7 +37,7 @@ from twoloop.kernels.evaluation.inner_loop import evaluate, restore_constraints
 from twoloop.kernels.evaluation.tasks import PROJECT
 from twoloop.kernels.linalg.markowitz_lu import determinant_sign
 
-KEEP_BELOW_RATIO = 1.2  # methods that use the trend of errors keep the step size if it could grow by no more than this
+KEEP_BELOW_RATIO = 1.2  # methods that use the trend of errors keep a step size that would grow by at most this factor
 
 
 @compiled

@@ -68,7 +68,7 @@ COUNTED_FRACTION_OF_RUN = 0.3  # the cost so far counts as at least this fractio
 COST_OF_ANY_TRIAL = 100.0
 MIN_RATIO_TO_MOTION = 30.0  # above this times `_motion_rate`, the largest rate is "hidden": the motion does not show it
 QUIET_FACTOR = 10.0  # vibrations count as small if their velocities are at most this number of tolerances
-# a trial begins if step size * (largest rate) / (stability limit) exceeds this, and the rate is hidden or of vibrations
+# least step size * (largest rate) / (stability limit) for a trial because the motion hardly shows the largest rate
 MIN_HIDDEN_RATIO = 0.05
 DIFFERENCE_STEP = 1e-4  # time step of the finite difference in `_motion_rate`, relative to 1 / (largest rate)
 RETURN_BELOW = 0.4  # the explicit method is tried again if step size * (largest rate) / (stability limit) is below this
@@ -303,7 +303,7 @@ def _judge_trial(w, options, memory, t):
 
 @compiled
 def _phase_to_begin(f, w, options, memory, tolerances, t, state, new_state):
-    """Estimate the largest rate; return the phase of a trial, ON_TRIAL or BACK_ON_TRIAL, if it must begin, else -1."""
+    """Estimate the largest rate; return ON_TRIAL or BACK_ON_TRIAL if such a trial must begin, else -1."""
     n = w.Q.size
     memory[RATE] = _largest_rate(f, w, memory, t, state, new_state)
     cost_per_second, cost = _cost_per_second(w, options, memory, t), _cost_of_run(w, options)

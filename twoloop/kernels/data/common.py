@@ -437,8 +437,8 @@ def typical_size(tolerances, x):
 def max_change_by_rounding(limit, change, change_q, change_v, size_q, size_v):
     """Return the largest relative change in an iteration that may be due to rounding.
 
-    `change` is the larger one of change_q / size_q and change_v / size_v. Changes may be due to rounding
-    if, relative to the larger one of size and 1, they are at most `limit`.
+    `change` is the larger one of change_q / size_q and change_v / size_v. Changes may be due to rounding if they are at
+    most `limit`, relative to the larger one of the size and 1.
     """
     rounded = max(change_q / max(size_q, 1.0), change_v / max(size_v, 1.0))
     return limit * (change / rounded) if rounded > 0.0 else limit

@@ -220,9 +220,9 @@ def _index_of_near_position(q, rows, n_c, records):
 def _is_consistent(C, rate, rows, q, v, records, tolerance):
     """Return True if (q, v) satisfies the constraints up to rounding errors; `rows`: [C_q; A], `rate`: C_t and b.
 
-    A violation is compared with the terms of its constraint. In these, the size of a coordinate counts as at least its
-    size in `records` (see `evaluate_start`), and at least the rounding error of the largest coordinate. Else a
-    constraint on coordinates that are zero up to rounding, such as those normal to a plane of motion, seems violated.
+    A violation is compared with the terms of the constraint. In these terms, a coordinate counts as at least its size
+    in `records` (see `evaluate_start`), and at least the rounding error of the largest coordinate. Else a constraint
+    on coordinates that are zero up to rounding, such as those normal to a plane of motion, would seem violated.
     """
     fastest, rounding = largest_of(v), ROUNDING_OF_ZERO * largest_of(q)
     begin = _index_of_near_position(q, rows, C.size, records)

@@ -117,7 +117,7 @@ def largest_difference_step(q, v):
 
 @merged
 def _difference_side(w, t, e):
-    """Return the side of t on which to take differences: 0 (both) or, if C_t or b jumps near, 1 (after t) or -1."""
+    """Return the side of t on which to take differences: 0 (both) or, if C_t or b jumps near t, 1 (after t) or -1."""
     since_jump, until_jump = t - w.last_jump, w.next_jump - t
     if min(since_jump, until_jump) >= 2.0 * e:
         return 0.0
@@ -129,7 +129,7 @@ def _fill_gamma(f, w, t, q, v, e, first, last):
     """Store Gamma[first:last] in w.Gamma, extrapolated from differences with the time steps e and 2 e.
 
     Return the largest |Gamma_i|, the largest |difference| of Gamma_i with both time steps, and the largest |G_ij v_j|
-    (G: constraint Jacobian). If Gamma is not finite, the first two are NaN.
+    (G: constraint Jacobian). If Gamma is not finite, the first two results are NaN.
     """
     Gamma_coarse = w.Gamma_tried[0]
     side = _difference_side(w, t, e)

@@ -146,7 +146,7 @@ def compute_multipliers(f, w, a, lam):
 def _factor_rows_at(f, w, t, q, v):
     """Store the constraint Jacobian at q and factors of its dependent columns in w; return DONE or a failure code.
 
-    In the form NULL_SPACE, also store its null space; with the callback `kinematics`, also Gamma at (q, v).
+    In the form NULL_SPACE, also store the null space; with the callback `kinematics`, also Gamma at (q, v).
     """
     if f.kinematics_given == 1:
         kinematics(f, w, t, q, v)

@@ -244,7 +244,7 @@ def _adopt_rows(w):
 
 @compiled
 def choose_rows(f, w, t, q):
-    """Choose the independent rows of C_q at (t, q); return a code: RANK_DIFFERS if w has space for another number."""
+    """Choose the independent rows of C_q at (t, q); return a code: RANK_DIFFERS if w has space for another rank."""
     w.n_partitions += 1
     fill_mass_values(f, w, t, q)
     fill_jacobian_values(f, w, t, q)

@@ -154,7 +154,7 @@ def _smallest_size(control, n):
 
 @merged
 def _store_typical_size(control, work, n, vector):
-    """Store in DISPLACED the size that smaller components of a vector (at offset `vector`) count as: `typical_size`."""
+    """Store in DISPLACED the typical size of q or v (at offset `vector`), for displacements in finite differences."""
     least = _smallest_size(control, n)
     for k in range(LANES):
         size = least

@@ -128,7 +128,7 @@ def factor_gram(work, pattern, moves, n_rows, n_redundant, G, row, factors):
 
 @compiled
 def _find_redundant_combinations(work, pattern, n_rows, n_redundant, row, factors):
-    """Store Z in `factors`: eigenvectors of G G^T for the n_redundant least eigenvalues, NaN for a large eigenvalue."""
+    """Store Z in `factors`: eigenvectors of G G^T for the n_redundant least eigenvalues; NaN if these are too large."""
     gram = factors + pattern[n_rows] - pattern[0] + n_rows
     Z = gram + n_rows * n_rows
     scratch = Z + n_redundant * n_rows
@@ -444,7 +444,7 @@ TABLE, STATES = types.float64[:, ::1], types.float64[:, :, ::1]
 
 @compiled
 def _relative_residual(value, allowed):
-    """Return |value| / allowed: 0 if `value` is zero; infinity if `value` is not finite, or only `allowed` is zero."""
+    """Return |value| / allowed: 0 if `value` is zero; infinity if only `allowed` is zero, or `value` is not finite."""
     if not np.isfinite(value):
         return np.inf
     if value == 0.0:

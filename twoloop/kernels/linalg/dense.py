@@ -131,8 +131,8 @@ def lu_solve(A, pivots, x):
 def ldl_factor(A):
     """Factor a symmetric matrix A = U^T D^-1 U in place; return False if A is not positive definite or not finite.
 
-    U is upper triangular; D, its diagonal, contains the pivots d_k. Store 1/d_k on the diagonal of A, and the other
-    entries of U above it. Entries below the diagonal are neither read nor changed.
+    U is upper triangular; D, the diagonal of U, contains the pivots d_k. Store 1/d_k on the diagonal of A, and the
+    other entries of U above the diagonal. Entries below the diagonal are neither read nor changed.
     """
     n = A.shape[0]
     for k in range(n):
