@@ -9,7 +9,7 @@ kernel requests it: most loops in kernels are short, so that tests of their leng
 
 While a kernel is compiled, `kernel_rules` replaces some functions of numba. One replacement leaves out the code for
 negative indices, which kernels do not use: this code would hide from LLVM that elements are adjacent. Functions of
-the user keep it. The other replacements make compilation faster: they cache results that numba would compute
+the user keep this code. The other replacements make compilation faster: they cache results that numba would compute
 again and again, or do the same work with less code.
 
 Modules that need private parts of numba to generate code import these parts from this module.

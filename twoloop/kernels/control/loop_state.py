@@ -1,6 +1,6 @@
 """Indices into `control` and `clock`, the arrays of the integration loop, and the codes that `advance` returns.
 
-`advance` (kernels/advance.py) is the loop over steps. `control` contains its settings; the first entries are the
+`advance` (kernels/advance.py) is the loop over steps. `control` contains the settings; the first entries are the
 parameters of step-size control. `clock` contains variables, such as the present time, from which the next call of
 `advance` continues; the first entries are the history of step-size control.
 """

@@ -20,7 +20,7 @@ SHRINKAGE = 0.8  # size of a step that is repeated again with projected stages, 
 MIN_STEP_NEAR_SINGULAR = 0.001  # shortest useful step near a singular position, relative to the longest recent step
 # if no crossing can be attempted, the run ends when the smallest pivot is below this fraction of its maximum in the run
 UNDETERMINED_PIVOT = 1e-6
-CHECK_INTERVAL = 16  # number of steps between checks of the partition, which generated code does not need, in its runs
+CHECK_INTERVAL = 16  # number of steps between checks of the partition if generated code runs, which needs no partition
 # in the augmented form, with n degrees of freedom, the partition is checked every 1 + n // FREEDOMS_PER_CHECK steps,
 # because each check computes the null space of [C_q; A], a dense matrix that steps in this form do not need
 FREEDOMS_PER_CHECK = 32
@@ -151,8 +151,8 @@ def record_pivot_at_output(f, w, clock, state):
     """Reduce clock[PIVOT_AT_OUTPUT] to the ratio of the smallest to the largest pivot at `state` if this is smaller."""
     pivot = min_pivot_ratio(f, w, clock[at.T], state[: w.Q.size])
     if f.form == FIXED_ORDER and pivot > 0.0:
-        # pivots of the fixed-order form are sines of angles between rows. All are small in large mechanisms: only the
-        # ratio to the largest value of the smallest pivot so far shows a singular position
+        # pivots of the fixed-order form are sines of angles between rows, and all small in large mechanisms: only the
+        # ratio of the smallest pivot to the largest value that it has had so far shows a singular position
         pivot /= max(pivot, clock[at.LARGEST_PIVOT])
     clock[at.PIVOT_AT_OUTPUT] = min(clock[at.PIVOT_AT_OUTPUT], pivot)
 

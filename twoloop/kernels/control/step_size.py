@@ -8,7 +8,7 @@ Two measures show errors that the error estimate of the integration formula miss
 - `prediction_error` compares the dependent positions that the formula predicts with positions that satisfy the
   constraints. In the same assembly of the mechanism, the difference is of the order of the step's error. If the step
   has ended in another assembly, the difference is larger, even if the independent coordinates are smooth. If all
-  coordinates are prescribed, this is the only error estimate. Where two assemblies come close to one another, a large
+  coordinates are prescribed, there is no other error estimate. Where two assemblies come close to one another, a large
   step may end in the wrong assembly with a small difference. Then the sign of det C_qd changes (C_qd: the dependent
   columns of C_q). In a true motion, this happens only at a singular position, and predictions of short steps there are
   nearly exact. So if the sign changes in a step, its prediction must be nearly exact.

@@ -1,7 +1,7 @@
 """Indices into the arrays that kernels share, and the codes that kernels return.
 
 Kernels (compiled functions) keep their state in arrays, because compiled code passes arrays by reference. Each group
-below names the indices of one array; control/loop_state.py contains those that only the loop over steps uses. Kernels
+below names the indices of one array; control/loop_state.py has the indices that only the loop over steps uses. Kernels
 read elements of `Work.notes`, `Work.counters` and `Functions.flags` as attributes: w.pivot is w.notes[PIVOT].
 """
 

@@ -6,7 +6,7 @@ are chosen so that the entries of C_q in these units have similar sizes. The lin
 coordinates can move before the row changes much (checks/scales.py). `f` is the kit, with the callbacks.
 
 `compare_traces` compares callbacks with their traces, see generate/traced_values.py. For each number that a trace
-yields, it also computes a bound of the rounding error, in units of EPS, the spacing of floating-point numbers at 1.
+yields, the kernel computes a bound of the rounding error, in units of EPS, the spacing of floating-point numbers at 1.
 """
 
 import math

@@ -2,7 +2,7 @@
 
 C_q belongs to constraints C(t, q) = 0, A to constraints A v + b = 0, so that G v + (C_t, b) = 0. The derivative of this
 equation along the motion is G a = Gamma for accelerations a. Two central differences, with the time steps e and 2 e,
-yield Gamma to order 4. Their difference estimates the error, by which e is chosen (`f`: kit, `w`: workspace).
+yield Gamma to order 4. The difference of the two estimates the error, by which e is chosen. `f`: kit, `w`: workspace.
 """
 
 import numpy as np

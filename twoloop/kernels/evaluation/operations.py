@@ -3,8 +3,7 @@
 A traced program is the list of operations that a function does on symbols. If no callback computes C_q or Gamma, a
 program does (generate/derived_callbacks.py). Programs also compute forces, prescribed motions and constraint rows that
 the user of a model defines by functions (bodies/programs.py). The exact derivative of a function, such as tanh, may
-overflow where the function does not: then the caller uses, for example, finite differences. (`f`: the kit, `w`: the
-workspace)
+overflow where the function does not: then the caller uses, for example, finite differences. `f`: kit, `w`: workspace.
 """
 
 import math

@@ -4,7 +4,7 @@ There is no partition: steps integrate all coordinates, and the stages need not 
 forms compute dependent coordinates, this form moves all coordinates to the nearest state on the constraints, in the
 metric of M. If sparse factors do not show which rows are independent, a task returns NEEDS_DENSE, and the run continues
 with the forms of linalg/saddle_point.py, which methods with a partition always use. Callbacks may return the nonzero
-entries of C_q; then no array has n_c times n_q numbers. They may also fill dense matrices; then entries are copied.
+entries of C_q; then no array has n_c times n_q numbers. If they fill dense matrices, the entries are copied.
 
 If rows of G = C_q are redundant, many multipliers lam have the same reactions p = G^T lam. The shortest lam is used. It
 equals G x for some vector x; x and lam solve

@@ -22,7 +22,7 @@ from twoloop.kernels.lanes.layout import (
     remove_run,
 )
 
-# indices in `options`, after the N_RULE numbers of the step-size rule. From N_HEAD on, `options` contains the method's
+# indices in `options`, after the N_RULE numbers of the step-size rule; the method's options begin at index N_HEAD
 # - JUMP_RATIO: assumed largest ratio of true error to error estimate in a step in which a force jumps
 # - FIRST: first step size, relative to the shortest time scale of the motion at the start
 # - LEAST: the smaller one of the tolerances rtol and atol
@@ -82,7 +82,7 @@ def begin_control(options, control, work, n, state, a, start):
 
 @merged
 def _round_steps(work, control):
-    """Round H, the step sizes, to differences of two times: else states and times of long runs drift apart."""
+    """Round H, the step sizes, so that steps end at floating-point times: else states and times of long runs drift."""
     for k in range(LANES):
         h, t = work[at.H * LANES + k], work[at.T * LANES + k]
         if h != control[at.T1] - t:
