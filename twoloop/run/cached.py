@@ -466,7 +466,7 @@ class CacheEntry(NamedTuple):
     shared: SharedSetup | None = None  # setup for systems that differ only in parameters; None: one system
 
 
-# initial cache of a system's runs: start (t0, q0, v0) of the last run, or None; dict of the cache entries, by options;
+# initial cache of a system's runs, a tuple: start (t0, q0, v0) of the last run, or None; cache entries by options;
 # id() of the generated code of the last run, or None if that run reused a cache entry
 EMPTY_CACHE: tuple[Any, dict[Any, tuple[CacheEntry, ...]], int | None] = (None, {}, None)
 

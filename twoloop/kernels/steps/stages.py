@@ -132,10 +132,10 @@ def estimate_end_error(tolerances, options, h, state, new_state, A_stage):
     return largest
 
 
-# indices of the scalars in the part of `options` for Newton's method, counted from the beginning of this part. After
-# the scalars, the part contains the weights (s) of the error estimate. Then follows data of each eigenvalue of the
-# matrix A = T diag(eigenvalues) T^-1 of the Butcher tableau, T being the matrix of eigenvectors: real and imaginary
-# part of the eigenvalue; row of T^-1 and column of T that belong to it (of each, s real, then s imaginary parts)
+# indices of the scalars in the part of `options` for Newton's method, counted from the beginning of this part. The
+# weights (s) of the error estimate follow. Then the part contains for each eigenvalue of the tableau's A the real and
+# imaginary part of the eigenvalue, its row of X^-1, and its column of X (of each, s real, then s imaginary parts),
+# where the columns of X are the eigenvectors of A
 (
     N_REAL,  # number of real eigenvalues of the matrix A of the Butcher tableau
     N_PAIRS,  # number of pairs of conjugate complex eigenvalues of the matrix A of the Butcher tableau
@@ -151,7 +151,7 @@ def estimate_end_error(tolerances, options, h, state, new_state, A_stage):
     HAS_PREVIOUS,  # 1: the block PREVIOUS contains the stage accelerations of the last accepted step
     H_PREVIOUS,  # size of the last accepted step (s)
     HAS_JACOBIAN,  # 1: Newton's method may use the stored derivatives of accelerations or forces; 0: compute new ones
-    IS_FRESH,  # 1: the stored derivatives were computed for the stages of this step; 0: for another step, or its end
+    IS_FRESH,  # 1: the stored derivatives belong to the stages of this step; 0: to an earlier step, or to the end of a step
     PARTITION_NUMBER,  # number of partitions of coordinates (w.generation) when the stored derivatives were computed
     H_FACTORED,  # step size (s) for which the linear systems of Newton's method are factored; 0: no factors are stored
     CONTRACTION,  # ratio of the last correction of Newton's method to the one before
@@ -161,8 +161,8 @@ def estimate_end_error(tolerances, options, h, state, new_state, A_stage):
     DERIVATIVES_RENEWED,  # 1: diagonal_step.py has computed new derivatives at the end of the step; 0: it has not
     N_MEMORY_SCALARS,
 ) = range(14)
-# indices of the blocks (s, n_q) in `memory`: stage accelerations of the last accepted and of the attempted step;
-# residuals of Newton's method; positions and velocities of the stages
+# indices of the blocks (s, n_q) in `memory`. PREVIOUS, TRIAL: stage accelerations of the last accepted and of the
+# attempted step. RESIDUAL: residuals of Newton's method. Q_STAGE, V_STAGE: positions and velocities of the stages
 PREVIOUS, TRIAL, RESIDUAL, Q_STAGE, V_STAGE, N_BLOCKS = range(6)
 # indices of the vectors (n_q) after the blocks. A_NEW, Q_MOVED, V_MOVED: accelerations, positions and velocities of a
 # displaced state, for finite differences. E_Q, E_V: estimated errors of positions and of velocities. Q_MID, V_MID,
@@ -184,14 +184,14 @@ def newton_options(
 
     A, b, c: Butcher tableau; A must be diagonalizable. `tests_velocities`: value of TESTS_VELOCITIES. See N_REAL.
     """
-    values, T = np.linalg.eig(A)
-    inverse = np.linalg.inv(T)
+    values, vectors = np.linalg.eig(A)
+    inverse = np.linalg.inv(vectors)
     reals = [k for k in range(len(b)) if values[k].imag == 0.0]
     pairs = [k for k in range(len(b)) if values[k].imag > 0.0]
     gamma0 = float(values[reals[0]].real) if reals else float(np.abs(values).min())
     parts: list[Any] = [[len(reals), len(pairs), gamma0, float(tests_velocities)], _error_weights(b, c, gamma0)]
     for k in reals + pairs:
-        row, column = inverse[k], T[:, k]
+        row, column = inverse[k], vectors[:, k]
         parts += [[values[k].real, values[k].imag], row.real, row.imag, column.real, column.imag]
     return np.concatenate([np.asarray(part, dtype=np.float64) for part in parts])
 
@@ -225,9 +225,9 @@ def n_matrices(n_systems: int) -> int:
     return SYSTEMS + 2 * n_systems
 
 
-# `options` of a diagonally implicit method begin with those of an implicit method of one stage, whose matrix A is
-# [[gamma]]; the part for Newton's method (N_REAL) begins at the index NEWTON_OFFSET. At the index DIAGONAL_OFFSET, the
-# number of stages follows, then the arguments A, c, `weights`, `jump_weights` and `embedded` of `diagonal_options`
+# `options` of a diagonally implicit method begins like `options` of an implicit method of one stage, with the matrix
+# A = [[gamma]] and the part for Newton's method (see N_REAL) at the index NEWTON_OFFSET. At the index DIAGONAL_OFFSET,
+# the number of stages follows, then the arguments A, c, `weights`, `jump_weights`, `embedded` of `diagonal_options`
 NEWTON_OFFSET = N_SCALARS + 2 + 5
 DIAGONAL_OFFSET = NEWTON_OFFSET + N_EIGEN_SCALARS + 1 + 2 + 4
 

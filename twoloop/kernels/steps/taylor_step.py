@@ -50,8 +50,8 @@ from twoloop.kernels.linalg.saddle_point import solve_with_multipliers
     KEEP,  # 1: all steps are parts of one long step, and use the series about its beginning; 0: each step has its own
     N_SCALARS,
 ) = range(7)
-# the 13 arrays that describe a list of operations (OperationGroups in twoloop.generate.series): array 0: groups of
-# operations of the same kind; arrays 1 to 6: first argument of each operation; arrays 7 to 12: second argument
+# 13 arrays describe a list of operations (OperationGroups in twoloop.generate.series). Array 0 contains the groups of
+# operations of the same kind, arrays 1 to 6 the first argument of each operation, arrays 7 to 12 the second argument
 GROUPS, FIRST, SECOND, N_TABLE = 0, 1, 7, 13
 # six arrays describe a list of affine expressions (Sums in twoloop.generate.series), such as the first arguments.
 # COLUMN, COEFFICIENT: quantity and factor of the first term of each expression. CONSTANT: constant of each expression.

@@ -47,7 +47,7 @@ def filtered_velocity_error(w, memory, tolerances, z, unfiltered, filtered_once,
         largest_v = max(largest_v, abs(v[w.independent[i]]))
         largest_a = max(largest_a, abs(a[w.independent[i]]), abs(a1[w.independent[i]]))
         largest = max(largest, abs(filtered_twice[i]))
-        # as filtered = (I - z J)^-1 unfiltered, the last term is component i of (z J)^2 filtered_twice
+        # as each filter multiplies by (I - z J)^-1, this difference is component i of (z J)^2 filtered_twice
         curvature = max(curvature, abs(filtered_twice[i] - 2.0 * filtered_once[i] + unfiltered[i]))
     if largest > 0.0:
         memory[at.ERROR_DURATION] = z * np.sqrt(largest / curvature)
