@@ -96,7 +96,7 @@ class StiffnessSample(NamedTuple):
     q: Array
     v: Array
     a: Array
-    h: float  # step size before the state (s)
+    h: float  # median size (s) of the last steps before the state
     vibration: float  # the method is stable if (step size) * (angular frequency of a vibration) is at most this
     decay: float  # the method is stable if (step size) * (rate of a decay) is at most this
 

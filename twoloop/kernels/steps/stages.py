@@ -151,7 +151,7 @@ def estimate_end_error(tolerances, options, h, state, new_state, A_stage):
     HAS_PREVIOUS,  # 1: the block PREVIOUS contains the stage accelerations of the last accepted step
     H_PREVIOUS,  # size of the last accepted step (s)
     HAS_JACOBIAN,  # 1: Newton's method may use the stored derivatives of accelerations or forces; 0: compute new ones
-    IS_FRESH,  # 1: the stored derivatives belong to the stages of this step; 0: to an earlier step, or to an end
+    IS_FRESH,  # 1: the stored derivatives belong to the stages of this step; 0: to earlier stages, or to a step's end
     PARTITION_NUMBER,  # number of partitions of coordinates (w.generation) when the stored derivatives were computed
     H_FACTORED,  # step size (s) for which the linear systems of Newton's method are factored; 0: no factors are stored
     CONTRACTION,  # ratio of the last correction of Newton's method to the one before
