@@ -83,8 +83,8 @@ GAP_RATIO = 10
 def _first_step_size(state, n, t, span, smallest):
     """Return the first step size (s): FIRST_STEP times the shortest time scale of the motion from `state` [q, v, a].
 
-    The time scales are the duration `span` (s) of the run, and the times in which q changes by max|q| or, if this is
-    larger, by `smallest`; and v by max|v|. The size is at least MIN_FIRST_STEP floating-point spacings at t.
+    The time scales are the duration `span` (s) of the run, the times in which q changes by the larger one of max|q| and
+    `smallest`, and the time in which v changes by max|v|. The step has at least MIN_FIRST_STEP spacings of times at t.
     """
     distance, speed, acceleration = smallest, 0.0, 0.0
     for j in range(n):
@@ -154,12 +154,12 @@ REFUSED = -1  # returned code: no steps were taken; Python must set up the run a
 IN_DOUBT = -2  # returned code: no steps were taken; Python must check whether the start satisfies the constraints
 UNUSUAL = -3  # returned code: steps were taken, but Python must read the report, and may have to continue the run
 UNCHOSEN = -4  # returned code: no steps were taken; Python must check whether the generated code suits the start
-# values of `checks`: Python has checked nothing; that the start satisfies the constraints; also that the generated code
-# suits it
+# values of `checks`. STATE_CHECKED: Python has checked that the start satisfies the constraints. CHOICES_CHECKED:
+# Python has also checked that the generated code suits the start
 NOTHING_CHECKED, STATE_CHECKED, CHOICES_CHECKED = 0, 1, 2
 
 # arrays of a run, which later runs with the same options reuse. Among them are
-# - `numbers`: one array with the parts clock, control, tolerances; `start_numbers`: what it contains before a run
+# - `numbers`: one array with the parts clock, control, tolerances; `start_numbers`: `numbers` before a run
 # - `start_memory`: numbers that the method's `memory` contains before a run, at the indices `memory_places`
 # - `last_start`: t, t1, q and v of the last start; `start_rows`: indices of the independent constraint rows there
 # - `saved`, `saved_integers`: all data computed at a start; if more runs begin at this start, they restore these data
@@ -193,12 +193,12 @@ RUN_ARRAYS.add_function("advance", i8(KIT, WORK, *(VECTOR,) * 9, MATRIX, MATRIX,
     RANK_LIMIT,  # a row of G is redundant if less than this fraction of it is orthogonal to other rows
     WEAK_LIMIT,  # M counts as singular if the ratio of its smallest to its largest eigenvalue is below this
     ADDED_SCALE,  # factor s: for a singular M, generated code uses M + s g^T g instead, where g are some rows of G
-    CONTRADICTS,  # refuse a start if a row of G a = gamma has a larger residual, relative to 1 or the sum of |terms|
+    CONTRADICTS,  # a start is refused if a residual of G a = gamma exceeds this times max(1, sum of |terms| in the row)
     MASS_FLAG,  # a start is refused unless the check of M returns this: DEFINITE, INDEFINITE, or 0 for a constant M
-    LEAST_PIVOT,  # a start is refused if the smallest pivot of C_q there is below this
+    LEAST_PIVOT,  # a start is refused if the smallest pivot of C_q at the start is below this
     EQUATION_FORM,  # initial f.form, the algebra that solves for accelerations
     FIRST_SIZE,  # first step size (s) that the user has chosen; 0: it is computed
-    LEAST_DISTANCE,  # argument `smallest` of _first_step_size
+    LEAST_DISTANCE,  # shortest displacement that determines a time scale: argument `smallest` of _first_step_size
     LONGEST,  # longest step (s): argument `longest` of _set_step_limits
     EVALUATES_WITHIN,  # 1: the method adds evaluations within long steps; 0: long steps are forbidden
     NEAR_PIVOT,  # Python must check a run if, at an output time, (smallest / largest pivot of C_q) is below this
@@ -207,7 +207,7 @@ RUN_ARRAYS.add_function("advance", i8(KIT, WORK, *(VECTOR,) * 9, MATRIX, MATRIX,
 ) = range(18)
 # indices in `expected`, the choice of constraint rows for which code was generated (empty without generated code)
 (
-    BOUND,  # index of the smallest accepted pivot, which `choose` returns; OF_PYTHON: only Python can make the choice
+    BOUND,  # index in MIN_PIVOTS (generate/elimination.py) of the pivot limit; OF_PYTHON: only Python can choose rows
     N_ROWS,  # number of independent rows
     N_ADDED,  # number of rows g that are added to a singular M as s g^T g
     FIRST_ROW,  # begin of two lists, one after the other: indices of the independent rows, and of the added rows
@@ -328,7 +328,7 @@ def _restore_start(b):
 
 N_EQUAL = 0  # last_start[N_EQUAL]: number of successive runs from the last start, counted up to 2
 START = 1  # last_start[START:]: the last start, [t, t1, q, v], where t1 is the end of the run
-NEVER, IS_SAVED = 0.0, 2.0  # values of last_start[N_EQUAL]: no run could begin there; data of this start are in `saved`
+NEVER, IS_SAVED = 0.0, 2.0  # last_start[N_EQUAL] is NEVER if no run could begin, IS_SAVED if `saved` has the data
 
 
 @exact
@@ -354,7 +354,7 @@ def _equals_last_start(last_start, t, t1, q, v):
     DEFECT,  # largest defect, divided by its tolerance
     LONGEST_GAP,  # longest time (s) between two evaluations of the equations
     END_CODE,  # code that `advance` returned
-    IS_NEW,  # 1: the start differs from that of the previous run; 0: it is the same
+    IS_NEW,  # 1: the start differs from the start of the previous run; 0: both are equal
     N_REPORT,  # index of the first counter (of steps, rejections, evaluations, ...)
 ) = range(11)
 N_HEAD = N_REPORT + N_COUNTERS  # length of the report with counters, without times and steps
