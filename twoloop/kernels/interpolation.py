@@ -22,7 +22,7 @@ MAX_GAP_RATIO = 8.0  # neighbouring steps count as equally long if the longest i
 # v is interpolated, not the derivative of q, if (rounding error of q) / (duration) exceeds this number of tolerances
 MAX_VELOCITY_ROUNDING = 10.0
 # pivot ratio: smallest / largest pivot of the constraint Jacobian at a position, see min_pivot_ratio in partition.py
-SINGULAR_PIVOT_RATIO = 0.01  # a position is singular if (pivot ratio) / (that at an end of the interval) is below this
+SINGULAR_PIVOT_RATIO = 0.01  # a position is singular below this part of the larger pivot ratio at the interval's ends
 SINGULAR_PIVOT = 1e-5  # a position is singular if its pivot ratio is below this
 # a position with a pivot ratio below WEAK_PIVOT is singular if v before the projection violated the constraints by less
 # than MAX_VIOLATION tolerances, so that rounding may explain the change of v; estimate: (pivot ratio) * (change of v)

@@ -345,7 +345,7 @@ class FunctionCopier:
         self.copies: dict[Any, Any] = {}  # replacements, by id of the original
 
     def replacement_of(self, value: Any, names: frozenset[str] = frozenset()) -> Any:
-        """Return the replacement of a helper, a tuple or (only attributes `names`) a user's module; else `value`."""
+        """Return the replacement of a helper, tuple or user's module (with attributes `names`), or any other value."""
         if self.is_copied(value):
             if id(value) not in self.copies:
                 self._add_copy(value)

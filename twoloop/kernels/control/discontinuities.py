@@ -93,7 +93,7 @@ def _allowed_error(f, w, tolerances, v, row):
 
 @compiled
 def unexplained_velocity_change(tolerances, h, state, new_state, n):
-    """Return the largest difference (tolerances) between a change of velocity in a step and h * (mean acceleration)."""
+    """Return the largest difference, in tolerances, of a velocity's change in a step from h * (mean acceleration)."""
     largest = 0.0
     for m in range(n):
         v, v1, a, a1 = state[n + m], new_state[n + m], state[2 * n + m], new_state[2 * n + m]
@@ -428,7 +428,7 @@ def _sample_ahead(f, w, tolerances, control, clock, next_change, t, size, last, 
     if may_resample and max_spacing < RESAMPLE_BELOW * clock[at.SAMPLED_EVERY]:
         clock[at.SAMPLED_TO] = t
     begin = max(t, clock[at.SAMPLED_TO])
-    is_at_change = clock[at.DISCONTINUITY] == clock[at.SAMPLED_TO]  # at a change, sample as closely as before
+    is_at_change = clock[at.DISCONTINUITY] == clock[at.SAMPLED_TO]  # then sample as closely as last time
     while begin < min(t + size, last, next_change):
         spacing, is_at_change = min(max_spacing, clock[at.SAMPLED_EVERY]) if is_at_change else max_spacing, False
         clock[at.WIDEST_SAMPLING] = max(clock[at.WIDEST_SAMPLING], spacing)

@@ -83,8 +83,8 @@ N_ESTIMATES_AFTER_SUCCESS = 4.0  # number of estimates of the largest rate from 
 # BACK_ON_TRIAL: the explicit method is on trial, after the implicit method was in use
 EXPLICIT, ON_TRIAL, IMPLICIT, BACK_ON_TRIAL = range(4)
 
-# `options` contains N_PAIR options of the pair (indices below); N_OF_EACH numbers for each method, namely parameters of
-# step-size control (loop_state.py) and, at REUSE_OF, w.reuse; and the options of the first and the second method.
+# `options` begins with N_PAIR options of the pair, at the indices below. Then follow N_OF_EACH numbers for each method,
+# parameters of step-size control (loop_state.py) and, at REUSE_OF, w.reuse; then the options of both methods.
 # - LIMIT: stability limit of step size * (largest rate). After N_ESTIMATES estimates above LIMIT, a trial begins
 # - MATRIX_COST: cost of a Jacobian, in evaluations of accelerations
 # - COST_RATIO: cost of an evaluation by the second (implicit) method, in evaluations by the first (explicit) one

@@ -221,7 +221,7 @@ def gamma_by_differences(f, w, t, q, v, first, last):
     if e > 0.0:
         largest, disagreement, terms = _fill_gamma(f, w, t, q, v, e, first, last)
         if np.isnan(largest) or disagreement == 0.0 or w.gamma_scale == 0.0:
-            return DONE  # a NaN, which the caller reports; no error; or no size of Gamma to compare errors with
+            return DONE  # accept a NaN (the caller reports it), a zero error, and any error if no scale is known
         rounding = ROUNDING_OF_TERMS * terms / largest_step
         w.gamma_scale = max(w.gamma_scale, largest, rounding / w.gamma_required)
         if disagreement < NEGLIGIBLE_DISAGREEMENT * w.gamma_scale:

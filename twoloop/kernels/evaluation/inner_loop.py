@@ -199,9 +199,9 @@ def project_state(f, w, t, q, v, theta, a, lam):
     """Project (q, v) onto the constraints; store accelerations `a` and multipliers lam; return DONE or a failure code.
 
     q and v change in place. Corrections x of q satisfy A x = 0, where A are the rows of non-holonomic constraints.
-    Iterations end after one that corrects q by at most theta, and v by at most theta max(1, max|v|). They also end
-    after one that corrects q by at most theta times w.pivot, the smallest pivot of C_q. Then v is accurate, too: per
-    unit of displacement, the directions that constraints allow turn by about 1 / w.pivot at most.
+    The last iteration corrects q by at most theta, and v by at most theta max(1, max|v|), or it corrects q by at most
+    theta * w.pivot; w.pivot is the smallest pivot of C_q. In the latter case, v is accurate, too: per unit of
+    displacement, the directions that constraints allow turn by about 1 / w.pivot at most.
     """
     last_correction = np.inf
     theta = max(theta, MIN_CORRECTION * w.rounded)
@@ -307,7 +307,7 @@ def inner_loop(f, w, task, t, q, v, tolerance, a, lam):
 def evaluate(f, w, t, q, v, tolerance, a):
     """Compute dependent from independent entries of q and v, and the accelerations `a`; return DONE or a failure code.
 
-    Newton's method for q ends after a correction of at most `tolerance`; up to w.reuse, the Jacobian is not updated.
+    Newton's method for q ends after a correction of at most `tolerance`; if it is at most w.reuse, keep the Jacobian.
     """
     return f.inner(f, w, tasks.EVALUATE, t, q, v, tolerance, a, w.lam)
 

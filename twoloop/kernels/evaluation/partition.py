@@ -324,7 +324,7 @@ def choose_oriented_partition(f, w, t, q):
 
 @compiled
 def _largest_coefficient(w):
-    """Return the largest |coefficient| of an independent row in the sum that equals a redundant row (row maxima 1)."""
+    """Return the largest |coefficient| in combinations of independent rows that equal redundant rows (maxima: 1)."""
     rows = rows_of(w.index_v)
     largest = 0.0
     begin = 0
