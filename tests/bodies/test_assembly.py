@@ -219,3 +219,18 @@ def test_the_freedom_of_large_models_is_that_by_full_matrices(made, monkeypatch)
         found = made().bodies.freedom
     monkeypatch.setattr(assembly, "dependence", lambda *_: None)
     assert made().bodies.freedom == found
+
+
+def test_velocities_of_light_bodies_do_not_depend_on_a_heavy_one_beside_them():
+    def start(heavy):
+        model = PlanarModel()
+        model.body("carriage", mass=heavy, inertia=heavy, position=(5.0, 1.0), velocity=(0.1, 0.0))
+        model.prismatic("ground", "carriage", at=(5.0, 1.0), axis=(1.0, 0.0))
+        places = [(0.0, 0.0), (0.01, 0.0), (0.02, 0.005), (0.02, 0.0)]
+        for name, begin, end in zip("abc", places, places[1:], strict=False):
+            spin = {"angular_velocity": 3.0} if name == "a" else {}
+            model.rod(name, begin, end, mass=1e-3, **spin)
+            model.revolute("ground" if name == "a" else chr(ord(name) - 1), name, at=begin)
+        return model.problem((0.0, 1.0)).v0
+
+    np.testing.assert_allclose(start(1e8), start(1.0), rtol=1e-9, atol=1e-9)

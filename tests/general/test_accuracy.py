@@ -70,7 +70,7 @@ def swing(size, time, method, rtol):
 
 
 @pytest.mark.parametrize("method", ["Lobatto16", "Gauss12", "RadauIIA5", "RadauIIA9", "TRBDF2", "ESDIRK4"])
-@pytest.mark.parametrize(("size", "time"), [(1e-9, 1e3), (1e-6, 1e4), (1e4, 1e-2)])
+@pytest.mark.parametrize(("size", "time"), [(1e-9, 1e3), (1e-6, 1e4), (1e6, 1e-3)])
 def test_errors_in_tolerances_do_not_depend_on_units(method, size, time):
     rtol = 1e-11 if method in ("Lobatto16", "Gauss12", "RadauIIA9") else 1e-6
     assert worst(swing(size, time, method, rtol), swing(1.0, 1.0, "DOP853", 1e-12)) < 60.0 * rtol

@@ -235,7 +235,7 @@ def test_rounding_of_coordinates_that_are_zero_does_not_end_a_motion():
 def test_a_velocity_along_the_floor_does_not_end_the_rebounds(across):
     falling, floor = unconstrained(lambda t, q, v: np.array([0.0, -1e-6]), 2), Stop(lambda t, q: q[1], 0.5)
     result = solve_with_stops(falling, (0.0, 14.0), [0.0, 1e-6], [across, 0.0], floor, atol=1e-12)
-    assert result.success and len(result.impacts) == 12, result.message
+    assert result.success and len(result.impacts) == 14, result.message
 
 
 @pytest.mark.parametrize("start", [0.0, 1.7e9])
@@ -247,6 +247,30 @@ def test_impacts_at_the_time_of_a_clock_and_just_before_the_end(start):
         assert (
             result.success and abs(result.q[0, -1] - max(0.0, GRAVITY * drop * late - 0.5 * GRAVITY * late**2)) < 2e-5
         )
+
+
+@pytest.mark.parametrize(("size", "time"), [(1e-9, 1e3), (1.0, 1e-9), (1e6, 1.0)])
+def test_impacts_do_not_depend_on_units(size, time):
+    falling, floor = unconstrained(lambda t, q, v: np.array([-GRAVITY * size / time**2])), Stop(lambda t, q: q[0], 0.5)
+    atol = 1e-8 * min(size, size / time)
+    result = solve_with_stops(falling, (0.0, 1.2 * time), [size], [0.0], floor, atol=atol)
+    drop = np.sqrt(2.0 / GRAVITY)
+    late, rate = 1.2 - 2.5 * drop, 0.25 * GRAVITY * drop  # since the third impact, with half the rate of the second
+    assert result.success and len(result.impacts) == 3, result.message
+    assert abs(result.q[0, -1] / size - (0.5 * rate * late - 0.5 * GRAVITY * late**2)) < 1e-7
+
+
+@pytest.mark.parametrize("heavy", [1.0, 1e5])
+def test_a_light_body_beside_a_heavy_one_has_an_impact_of_its_own(heavy):
+    model = PlanarModel(gravity=(0.0, -GRAVITY))
+    model.body("carriage", mass=heavy, inertia=heavy, position=(5.0, 1.0))
+    model.prismatic("ground", "carriage", at=(5.0, 1.0), axis=(1.0, 0.0))
+    latch = model.body("latch", mass=1e-3, inertia=1e-7 / 12.0, position=(0.0, 0.05), angle=0.7)
+    model.stop(latch, latch.point(-0.005, 0.0), "ground", (0.0, 0.0), normal=(0.0, 1.0), restitution=0.8)
+    _, result = moved(model, 0.11)
+    arm, rate = -0.005 * np.cos(0.7), result.impacts[0].v_before[4]
+    impulse = -1.8 * rate / (1e3 + arm**2 * 12e7)
+    np.testing.assert_allclose(result.impacts[0].v_after[4:], [rate + 1e3 * impulse, 12e7 * arm * impulse], rtol=1e-9)
 
 
 EQUAL, UNEQUAL = ([1.0] * 4, [1.0] * 3), ([1.0, 2.0, 1.5, 0.5], [0.3, 0.8, 0.2])  # masses and restitutions

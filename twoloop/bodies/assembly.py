@@ -112,6 +112,7 @@ def velocities(
         v = v + free @ np.linalg.lstsq(block, (target - v)[is_given], rcond=SINGULAR)[0]
         free = free @ null_space(block, rcond=SINGULAR)
     if free.shape[1]:
+        free[np.abs(free) < ROUNDING] = 0.0  # the inertia of heavy bodies would multiply rounding errors
         inert = free.T @ mass @ free
         v = v - free @ np.linalg.lstsq(inert, free.T @ (mass @ v), rcond=SINGULAR)[0]
     off = np.where(is_given, np.abs(v - target), 0.0)

@@ -18,7 +18,7 @@ from twoloop.kernels.data import indices
 from twoloop.methods.dop853 import DOP853
 from twoloop.problem.description import Stop
 from twoloop.problem.system import ConstrainedSystem
-from twoloop.run.fallbacks import NEGLIGIBLE_RATIO
+from twoloop.run.fallbacks import NEGLIGIBLE_RATIO, units_of_equations
 from twoloop.run.run import Run
 from twoloop.run.singular_start import Branch, branch_at
 
@@ -182,11 +182,13 @@ class ContactSystem:
         right_sides += [system.nonholonomic_gamma(t, q, v)] if system.n_a else []
         n, first_stop = system.n_q, system.n_q + system.n_c + system.n_a
         # the friction of sliding stops is proportional to the unknown forces of the stops, so it changes the matrix
-        K = np.block([[self._call("mass", t, q), rows.T], [rows, np.zeros((len(rows),) * 2)]])
+        mass = self._call("mass", t, q)
+        units, K = units_of_equations(mass, rows), np.block([[mass, rows.T], [rows, np.zeros((len(rows),) * 2)]])
         for place, k, coefficient in self._slipping:
             K[:n, first_stop + place] -= coefficient * slides[k]
         right = np.concatenate([Q, *right_sides, -self._rows("bias", t, q, v)])
-        forces = np.linalg.lstsq(K, right, rcond=NEGLIGIBLE_RATIO)[0][first_stop:]
+        scaled = K * units * units[:, None], units * right
+        forces = (units * np.linalg.lstsq(*scaled, rcond=NEGLIGIBLE_RATIO)[0])[first_stop:]
         return Q + sum(coefficient * forces[place] * slides[k] for place, k, coefficient in self._slipping)
 
     def build(self, names: str) -> ConstrainedSystem:

@@ -47,9 +47,10 @@ class Tangents(NamedTuple):
 
 def responses(system: ConstrainedSystem, t: float, q: Array, W: Array) -> Array:
     """Return X (n_q, k), changes of velocities by unit impulses along rows W: M X + G^T Y = W^T, with G X = 0."""
-    matrix, lengths, _ = scaled_equations(system, t, q)
-    right_side = np.vstack([W.T, np.zeros((len(lengths), len(W)))])
-    return np.asarray(np.linalg.lstsq(matrix, right_side, rcond=NEGLIGIBLE_RATIO)[0][: system.n_q], dtype=float)
+    matrix, units = scaled_equations(system, t, q)
+    right_side = np.vstack([W.T, np.zeros((len(matrix) - system.n_q, len(W)))]) * units[:, None]
+    solution = units[:, None] * np.linalg.lstsq(matrix, right_side, rcond=NEGLIGIBLE_RATIO)[0]
+    return np.asarray(solution[: system.n_q], dtype=float)
 
 
 def solve_complementarity(D: Array, b: Array) -> Array:

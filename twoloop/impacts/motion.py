@@ -60,7 +60,7 @@ if TYPE_CHECKING:
 REBOUND_HEIGHT = 0.01  # height of a rebound, relative to atol, below which the stop stays closed
 MIN_EVALUATIONS = 2000  # smallest number of evaluations of gaps, forces and rates of sliding in a motion
 PRESSED_RATIO = 1e3  # largest squared rate of stops that may press together, over rebound height times acceleration
-ROUNDING = 1e-13  # rounding errors of gaps and rates, relative to max(1, |q|)
+ROUNDING = 1e-13  # rounding errors of gaps and rates, relative to max(least_size, |q|)
 FIRST_STEP_RATIO = 1e-9  # smallest first step size of an arc, relative to max(1 s, t)
 MIN_TIME_LIMIT = 1e-6  # time limit, s, of an arc that begins after the time limit of the motion
 NEGLIGIBLE_POSITION = 1e-3  # a position so near to q = 0, in units of atol, is moved there
@@ -70,7 +70,7 @@ MAX_STALLED_TIME = 1e-13  # longest duration of a stalled arc, relative to max(1
 MAX_STALLED_ARCS = 30  # number of stalled arcs in a row that ends the motion
 RELEASE_REDUCTION = 1e-7  # relative reduction of the static friction of a joint just released, to avoid chattering
 STICKING_MARGIN = 1e-9  # relative tolerance in the comparison of the friction that holds a joint with its bound
-EQUAL_GAPS = 4e-15  # largest rounding difference of gaps that close at the same time, relative to max(1, |q|)
+EQUAL_GAPS = 4e-15  # largest rounding difference of gaps that close at the same time, relative to max(least_size, |q|)
 TIED_GAPS = 0.01  # largest gap, in rebound heights, of stops whose order of closing the tolerances leave open
 MAX_DISPLACEMENT = 10.0  # largest motion, in rebound heights, during a sequence of impacts without integration
 MAX_GAP = 1e4  # largest gap, in rebound heights, of stops in a sequence of impacts
@@ -116,10 +116,10 @@ class Motion:
         self.deadline = np.inf if limit is None else time.monotonic() + limit
         # impacts whose outcome depends on the law: time, stops, event
         self.law_dependent_impacts: list[tuple[float, list[str], str]] = []
-        self.noise = EQUAL_GAPS * max(1.0, float(np.abs(q).max()))
-        self.rebound_height = max(
-            REBOUND_HEIGHT * float(options["atol"].min()), ROUNDING * max(1.0, float(np.abs(q).max()))
-        )
+        least_atol, rtol = float(options["atol"].min()), options["rtol"]
+        self.least_size = min(1.0, least_atol / rtol) if rtol > 0.0 else 1.0
+        size = max(self.least_size, float(np.abs(q).max()))
+        self.noise, self.rebound_height = EQUAL_GAPS * size, max(REBOUND_HEIGHT * least_atol, ROUNDING * size)
         closed = np.flatnonzero(self.gaps.evaluate(t, q, v).g < -100.0 * self.rebound_height)
         if closed.size:
             gap = float(self.gaps.evaluate(t, q, v).g[closed[0]])
@@ -481,7 +481,7 @@ class Motion:
             needs_traces = isinstance(check_method(options["method"]), Taylor | Lobatto16)
             options |= {"method": PRESETS["auto"] if needs_traces else options["method"], "compiled": False}
         arc = solve_dae(system, (self.t, t1), self.q, self.v, events=events, dense_output=True, **options)
-        if 0.0 < t1 - arc.t[-1] <= NEAR * np.spacing(abs(t1)):  # an event so near t1 leaves no time for another arc
+        if arc.status == Status.EVENT and t1 - arc.t[-1] <= NEAR * np.spacing(abs(t1)):  # no time for another arc
             arc = solve_dae(system, (self.t, t1), self.q, self.v, dense_output=True, **options)
         self.arcs.append(arc)
         ended = {k for k in range(len(events)) if arc.t_events is not None and arc.t_events[k].size}
@@ -509,7 +509,7 @@ class Motion:
         tolerance, and explains the difference from velocities by Simpson's rule, velocities by this rule are returned.
         """
         v, h = arc.v[:, -1].copy(), float(arc.t[-1] - arc.t[-2]) if arc.t.size > 1 else 0.0
-        noise = ROUNDING * max(1.0, float(np.abs(arc.q[:, -1]).max()))
+        noise = ROUNDING * max(self.least_size, float(np.abs(arc.q[:, -1]).max()))
         tolerance = 0.1 * float(self.options["atol"].min())
         if not 0.0 < h * tolerance <= noise:
             return v
@@ -553,16 +553,23 @@ class Motion:
             return make_terminal(lambda t, q, v: 1.0)
         if sign != STICKS:  # the event is the end of sliding; the rate is zero at first if sliding has just begun
             u0 = sign * float(self.modes.gradients(self.q, k) @ self.v)
-            offset = u0 - self.rebound_height if k in self.resting_joints or k in self.released_joints else 0.0
+            rests = k in self.resting_joints or k in self.released_joints
+            offset = u0 - self._least_rate(self.modes.gradients(self.q, k)) if rests else 0.0
             return make_terminal(lambda t, q, v: sign * float(self.modes.gradients(q, k) @ v) - offset)
         return make_terminal(self._slip_event(lambda t, q, v: (friction(k, t, q, v), self.modes.static_friction[k])))
 
     def _stop_rest_event(self, k: int, sign: int) -> Any:
         """Return the event at which a stop ceases to slide; the rate is zero at first if sliding has just begun."""
         slide, slides = self.friction.slide_index[k], self.friction.slides
-        u0 = sign * float(slides.evaluate(self.t, self.q, self.v).u[slide])
-        offset = u0 - self.rebound_height if k in self.friction.resting_stops | self.friction.released_stops else 0.0
+        start = slides.evaluate(self.t, self.q, self.v)
+        u0 = sign * float(start.u[slide])
+        rests = k in self.friction.resting_stops | self.friction.released_stops
+        offset = u0 - self._least_rate(start.W[slide]) if rests else 0.0
         return lambda t, q, v: sign * float(slides.evaluate(t, q, v).u[slide]) - offset
+
+    def _least_rate(self, row: Array) -> float:
+        """Return the rate of sliding (m/s or rad/s) that is more than rounding: for slow motions, less than usually."""
+        return min(self.rebound_height, max(REST_RATE * float(np.abs(row) @ self.speeds), NEGLIGIBLE_VALUE))
 
     def _slip_event(self, balance: Any) -> Any:
         """Return the event at which the friction needed exceeds that available; balance(t, q, v) returns both."""

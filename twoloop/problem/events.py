@@ -205,7 +205,8 @@ class EventSearch:
             q, v = np.split(row(t), 2)
             return event(t, q, v)
 
-        t = float(brentq(value, *ends, xtol=PRECISION, rtol=PRECISION, maxiter=MAX_ITERATIONS))
+        xtol = PRECISION * max(abs(ends[0]), abs(ends[1]))
+        t = float(brentq(value, *ends, xtol=xtol, rtol=PRECISION, maxiter=MAX_ITERATIONS))
         return t, row(t)
 
 

@@ -60,6 +60,7 @@ Array = NDArray[np.float64]
 N_CORRECTIONS = 3  # number of Newton steps that suffice to reduce errors of positions from the tolerances to rounding
 # in least-squares solutions, singular values up to this fraction of the largest count as zero (redundant rows)
 NEGLIGIBLE_RATIO = 1e-12
+UNIT_RATIO = 256.0  # units in which least-squares problems are solved are powers of this number
 MAX_RESIDUAL = 1e-8  # largest residual of the equations for v after a jump, relative to their right-hand side
 
 
@@ -70,12 +71,12 @@ def state_after_jump(system: ConstrainedSystem, t: float, q: Array, v: Array) ->
     to v+. The equations M (v+ - v) + G^T p = 0 and G v+ + (C_t, b) = 0 are solved for v+ and p.
     """
     q = corrected_positions(system, t, q)
-    equations, norms, largest = scaled_equations(system, t, q)
-    right_side = np.concatenate([np.zeros(system.n_q), -system.velocity_constraint(t, q, v) / norms * largest])
+    equations, units = scaled_equations(system, t, q)
+    right_side = units * np.append(np.zeros(system.n_q), -system.velocity_constraint(t, q, v))
     change = np.linalg.lstsq(equations, right_side, rcond=NEGLIGIBLE_RATIO)[0]
     if not np.abs(equations @ change - right_side).max() <= MAX_RESIDUAL * np.abs(right_side).max():
         return None
-    return np.concatenate([q, v + change[: system.n_q]])
+    return np.concatenate([q, v + (units * change)[: system.n_q]])
 
 
 def corrected_positions(system: ConstrainedSystem, t: float, q: Array) -> Array:
@@ -85,13 +86,27 @@ def corrected_positions(system: ConstrainedSystem, t: float, q: Array) -> Array:
     return q
 
 
-def scaled_equations(system: ConstrainedSystem, t: float, q: Array) -> tuple[Array, Array, float]:
-    """Return the matrix [M G^T; G 0] with rows of G scaled to the norm max|M|, the norms before scaling, and max|M|."""
+def scaled_equations(system: ConstrainedSystem, t: float, q: Array) -> tuple[Array, Array]:
+    """Return the matrix K = [M G^T; G 0] in other units, and these units (n_q + n_rows,), see `units_of_equations`.
+
+    The solution x of K x = r is then units * y, where y is the solution of (scaled K) y = units * r.
+    """
     mass, rows = system.mass(t, q), system.rows(t, q)
-    norms, largest = np.linalg.norm(rows, axis=1), float(np.abs(mass).max())
-    norms[norms == 0.0] = 1.0  # rows of zeros are not scaled
-    scaled = rows / norms[:, None] * largest
-    return np.block([[mass, scaled.T], [scaled, np.zeros((len(rows), len(rows)))]]), norms, largest
+    units = units_of_equations(mass, rows)
+    return np.block([[mass, rows.T], [rows, np.zeros((len(rows),) * 2)]]) * units * units[:, None], units
+
+
+def units_of_equations(mass: Array, rows: Array) -> Array:
+    """Return units of accelerations and multipliers in which the diagonal of M and the norms of rows of G are similar.
+
+    Without these units, the inertia of a small body beside a large one counts as zero (NEGLIGIBLE_RATIO). They are
+    powers of UNIT_RATIO, so that scaling causes no rounding errors, and leaves ordinary masses as they are.
+    """
+    inertia = np.abs(np.diagonal(mass))
+    units = np.where(inertia > 0.0, inertia, max(float(inertia.max()), 1e-300)) ** -0.5
+    norms = np.linalg.norm(rows * units, axis=1)
+    units = np.append(units, 1.0 / np.where(norms > 0.0, norms, 1.0))
+    return UNIT_RATIO ** np.round(np.log2(units) / np.log2(UNIT_RATIO))
 
 
 # the step sizes tried in turn across a singular position are these ratios times the first size. Larger sizes help if a

@@ -18,6 +18,7 @@ from twoloop.checks.consistency import ConstraintWarning
 from twoloop.checks.structure import certainly_exceed, dependent_rows, describe_dependence, least_inertia, not_finite
 from twoloop.kernels.control.loop_state import DISPLACEMENT, INNER_TOL, initial_direction
 from twoloop.kernels.control.singular_positions import EPS
+from twoloop.kernels.control.step_size import EQUAL_SPACINGS
 from twoloop.kernels.data import indices
 from twoloop.methods.plan import Plan
 from twoloop.run.record import Status
@@ -340,9 +341,10 @@ def status_and_message(run: "Run", code: int, t1: float, stall: StallDetector) -
             f"{stopped}: with the fixed step_size = {run.control[a.FIXED_STEP]:g} {reason}. Take a smaller "
             "step_size, or leave it out for step-size control.",
         )
-    if run.max_step <= np.spacing(abs(t)):
-        limit = f"max_step = {run.max_step:g} is below the spacing of floating-point numbers, {np.spacing(abs(t)):.2g}"
-        return Status.STEP_TOO_SMALL, f"{stopped}: {limit}. Raise max_step, or let t_span begin at 0."
+    if run.max_step <= EQUAL_SPACINGS * np.spacing(abs(t)):
+        limit = f"{EQUAL_SPACINGS:g} spacings of floating-point numbers, {np.spacing(abs(t)):.2g}"
+        reason = f"max_step = {run.max_step:g} is at most {limit}"
+        return Status.STEP_TOO_SMALL, f"{stopped}: {reason}. Raise max_step, or let t_span begin at 0."
     least_ratio, words = least_inertia(run.system, t, run.state[: run.system.n_q])
     massless = f"There {words}. " if least_ratio < MAX_SINGULAR_RATIO else ""
     return (

@@ -61,10 +61,11 @@ LANES = 8 if has_wide_vectors() else 4  # number of runs at once: the number of 
     SHIFT,  # number from 0 to 1 that shifts the times of evaluations of the defect within a step
     EVALUATED,  # number of evaluations within the step, in addition to settings[N_EVALUATIONS]
     DISPLACED,  # least size of q (or v) to which displacements in finite differences are relative, see `typical_size`
+    LARGEST,  # largest |component| of the displaced vector, q or v
     PAST,  # size and error of the last accepted step, for step-size control: both of lane 0, then both of lane 1, ...
     _MORE_PAST,
     N_FIELDS,
-) = range(32)
+) = range(33)
 # names of functions that are generated for each mechanism; methods of the same names, such as `commit` in
 # generate/lane_code.py, write the code. Arguments: order of the Taylor series, settings `control`, memory `work`
 TASKS = ("correct_positions", "correct_state", "check_redundant_rows", "compute_prediction_error", "commit")

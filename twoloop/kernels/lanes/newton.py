@@ -28,7 +28,7 @@ from twoloop.kernels.lanes.layout import (
     vector_range,
 )
 from twoloop.kernels.linalg.dense import sum_rows
-from twoloop.kernels.steps.newton_systems import MAX_ITERATIONS, MAX_ROUNDING_CORRECTION, displace
+from twoloop.kernels.steps.newton_systems import MAX_ITERATIONS, MAX_ROUNDING_CORRECTION, RELATIVE_DISPLACEMENT
 from twoloop.kernels.steps.stages import (
     GAMMA0,
     MAX_STEP_RATIO,
@@ -157,10 +157,12 @@ def _store_typical_size(control, work, n, vector):
     """Store in DISPLACED the typical size of q or v (at offset `vector`), for displacements in finite differences."""
     least = _smallest_size(control, n)
     for k in range(LANES):
-        size = least
+        size, largest = least, 0.0
         for j in range(n):
-            size = min(max(size, abs(work[(vector + j) * LANES + k])), 1.0)
+            largest = max(largest, abs(work[(vector + j) * LANES + k]))
+        size = min(max(size, largest), 1.0)
         work[at.DISPLACED * LANES + k] = size if size > TINY else 1.0
+        work[at.LARGEST * LANES + k] = largest
 
 
 @compiled
@@ -180,7 +182,11 @@ def compute_derivatives(code, settings, control, c, work):
         copy_vectors(work, middle, new, 2 * n)
         for k in range(LANES):
             index = (new + column) * LANES + k
-            work[index] = displace(work[index], work[at.DISPLACED * LANES + k])
+            size = max(work[at.DISPLACED * LANES + k], abs(work[index]))
+            if control[at.RTOL] > 0.0:
+                natural_size = control[at.ATOL + column % n] / control[at.RTOL]
+                size = max(size, min(work[at.LARGEST * LANES + k], natural_size))
+            work[index] += RELATIVE_DISPLACEMENT * size
         code.compute_accelerations(order, control, work)
         matrix = matrix_offset(memory, n, s, DERIVATIVE_Q if column < n else DERIVATIVE_V) + column % n
         for k in range(LANES):

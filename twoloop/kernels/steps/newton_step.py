@@ -119,9 +119,11 @@ def _solve_stages(f, w, options, memory, t, h, tolerances, q, v, A_stage):
         change = max(h * largest_v / scale_v, h * h * largest_q / scale_q)
         if not np.isfinite(change):
             return OUTER_DIVERGED
-        rounding_limit = max_change_by_rounding(
-            max_rounding, change, h * h * largest_q, h * largest_v, scale_q, scale_v
-        )
+        rounding_limit = max_rounding
+        if tolerances[ESTIMATE] == 1.0:
+            rounding_limit = max_change_by_rounding(
+                max_rounding, change, h * h * largest_q, h * largest_v, scale_q, scale_v
+            )
         if iteration > 0:
             contraction = change / previous_change if previous_change > 0.0 else 0.0
             memory[at.CONTRACTION] = contraction

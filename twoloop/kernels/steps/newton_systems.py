@@ -32,7 +32,7 @@ There are three kinds of storage:
 import numpy as np
 
 from twoloop.kernels.data.common import compiled, finite_vector, inlined, typical_size
-from twoloop.kernels.data.indices import DONE, FIXED_ORDER, NEEDS_DENSE, NOT_FINITE, SINGULAR
+from twoloop.kernels.data.indices import ATOL, DONE, FIXED_ORDER, NEEDS_DENSE, NOT_FINITE, RTOL, SINGULAR
 from twoloop.kernels.evaluation.constraints import constraint_rows
 from twoloop.kernels.evaluation.inner_loop import evaluate, find_tangents
 from twoloop.kernels.evaluation.sparse_inner_loop import fill_jacobian_values
@@ -46,7 +46,7 @@ from twoloop.kernels.linalg.band import (
     lu_band,
     solve_bordered,
 )
-from twoloop.kernels.linalg.dense import copy, copy_matrix, ldl_factor, ldl_solve_rows, lu_factor, lu_solve
+from twoloop.kernels.linalg.dense import copy, copy_matrix, largest_of, ldl_factor, ldl_solve_rows, lu_factor, lu_solve
 from twoloop.kernels.linalg.markowitz_lu import columns_of
 from twoloop.kernels.linalg.sparse_ldl import add_terms_of_redundant_rows
 from twoloop.kernels.linalg.sparse_lu import factor as factor_lu
@@ -87,17 +87,29 @@ DISPLACEMENT_INCREMENT, N_INCREMENTS = 0.37, 7
 
 
 @inlined
-def displace(value, size):
-    """Return `value` plus a displacement for finite differences, proportional to max(size, |value|)."""
-    return value + RELATIVE_DISPLACEMENT * max(size, abs(value))
+def _displacement_sizes(tolerances, x):
+    """Return the typical and the largest size of components of x (q or v), from which displacements follow."""
+    return typical_size(tolerances, x), largest_of(x)
 
 
 @inlined
-def displace_unequally(value, size, index):
-    """Return `value` plus a displacement that depends on the coordinate's `index`, see DISPLACEMENT_INCREMENT."""
-    return value + RELATIVE_DISPLACEMENT * max(size, abs(value)) * (
-        1.0 + DISPLACEMENT_INCREMENT * (index % N_INCREMENTS)
-    )
+def _displaced(tolerances, x, sizes, j):
+    """Return x_j plus a displacement for finite differences.
+
+    It is RELATIVE_DISPLACEMENT times the largest of |x_j|, the typical size, and atol_j / rtol or the largest |x| if
+    that is less: in large units, displacements would otherwise be rounding errors where x_j is zero.
+    """
+    size = max(sizes[0], abs(x[j]))
+    if tolerances[RTOL] > 0.0:
+        size = max(size, min(sizes[1], tolerances[ATOL + j] / tolerances[RTOL]))
+    return x[j] + RELATIVE_DISPLACEMENT * size
+
+
+@inlined
+def _displaced_unequally(tolerances, x, sizes, j, index):
+    """Return x_j plus a displacement that depends on the coordinate's `index`, see DISPLACEMENT_INCREMENT."""
+    displacement = _displaced(tolerances, x, sizes, j) - x[j]
+    return x[j] + displacement * (1.0 + DISPLACEMENT_INCREMENT * (index % N_INCREMENTS))
 
 
 @compiled
@@ -137,16 +149,16 @@ def _subtract_reaction_tangent(f, w, tolerances, t, q, moved, b, K):
     w.G must be C_q at (t, q). Coordinates j, j + 2 b + 1, ... affect different rows: displace them together (`moved`).
     """
     n = q.size
-    size = typical_size(tolerances, q)
+    sizes = _displacement_sizes(tolerances, q)
     for j in range(n):
-        moved[j] = displace_unequally(q[j], size, j)
+        moved[j] = _displaced_unequally(tolerances, q, sizes, j, j)
     if not _has_jacobian_changed(f, w, t, moved):
         return
     width = min(n, 2 * b + 1)
     for group in range(width):
         copy(q, moved)
         for j in range(group, n, width):
-            moved[j] = displace(q[j], size)
+            moved[j] = _displaced(tolerances, q, sizes, j)
         if not _has_jacobian_changed(f, w, t, moved):
             continue
         for j in range(group, n, width):
@@ -248,12 +260,12 @@ def _fill_jacobians_from_tangents(f, w, tolerances, memory, s, t, q, v):
 def _fill_by_differences(f, w, options, tolerances, t, q, v, a, by_v, q_moved, v_moved, a_new, J):
     """Store in J the derivative of accelerations by q_i (if `by_v`, by v_i), as differences from `a` at (t, q, v)."""
     base, moved = (v, v_moved) if by_v else (q, q_moved)
-    size = typical_size(tolerances, base)
+    sizes = _displacement_sizes(tolerances, base)
     for column in range(w.independent.size):
         j = w.independent[column]
         copy(q, q_moved)
         copy(v, v_moved)
-        moved[j] = displace(base[j], size)
+        moved[j] = _displaced(tolerances, base, sizes, j)
         displacement = moved[j] - base[j]
         code = evaluate(f, w, t, q_moved, v_moved, options[at.INNER_TOL], a_new)
         if code != DONE:
@@ -280,10 +292,10 @@ def _fill_dense_jacobians(f, w, options, tolerances, memory, s, t, q, v, a):
         return code
     # displace all velocities at once: if this changes no acceleration, J_v, the derivative by velocities, is zero
     copy(q, q_moved)
-    size = typical_size(tolerances, v)
+    sizes = _displacement_sizes(tolerances, v)
     for column in range(m):
         j = w.independent[column]
-        v_moved[j] = displace_unequally(v[j], size, column)
+        v_moved[j] = _displaced_unequally(tolerances, v, sizes, j, column)
     code = evaluate(f, w, t, q_moved, v_moved, options[at.INNER_TOL], a_new)
     if code != DONE:
         return code
@@ -376,11 +388,11 @@ def _fill_band(f, w, tolerances, t, q, v, by_v, base, moved, b, band):
     """
     n = q.size
     base_point = v if by_v else q
-    size = typical_size(tolerances, base_point)
+    sizes = _displacement_sizes(tolerances, base_point)
     for group in range(2 * b + 1):
         copy(base_point, moved)
         for j in range(group, n, 2 * b + 1):
-            moved[j] = displace(base_point[j], size)
+            moved[j] = _displaced(tolerances, base_point, sizes, j)
         if by_v:
             _update_banded_residual(f, w, t, q, moved)
         else:
@@ -444,9 +456,9 @@ def _fill_banded_tangents(f, w, tolerances, memory, s, t, q, v):
     if code != DONE:
         return code
     # displace all velocities at once: if this does not change the residual, the derivative D by velocities is zero
-    size = typical_size(tolerances, v)
+    sizes = _displacement_sizes(tolerances, v)
     for j in range(n):
-        moved[j] = displace_unequally(v[j], size, j)
+        moved[j] = _displaced_unequally(tolerances, v, sizes, j, j)
     _update_banded_residual(f, w, t, q, moved)
     memory[at.HAS_DAMPING] = 0.0
     for i in range(n):
@@ -621,13 +633,13 @@ def _fill_tangent_entries_by_differences(f, w, tolerances, t, q, v, by_v, base, 
     """
     rows, columns, begins = tangent_entries_of(f.newton_program)
     base_point = v if by_v else q
-    size = typical_size(tolerances, base_point)
+    sizes = _displacement_sizes(tolerances, base_point)
     for group in range(begins.size - 1):
         copy(base_point, moved)
         first, last = begins[group], begins[group + 1]
         for k in range(first, last):
             j = columns[k]
-            moved[j] = displace(base_point[j], size)
+            moved[j] = _displaced(tolerances, base_point, sizes, j)
         if by_v:
             _fill_sparse_residual(f, w, t, q, moved, False, residual)
         else:
@@ -677,15 +689,15 @@ def _fill_sparse_tangents(f, w, tolerances, memory, t, q, v):
     code = _fill_tangent_entries_by_differences(f, w, tolerances, t, q, v, False, base, residual, moved, K)
     if code != DONE:
         return code
-    size = typical_size(tolerances, q)
+    sizes = _displacement_sizes(tolerances, q)
     for j in range(q.size):
-        moved[j] = displace_unequally(q[j], size, j)
+        moved[j] = _displaced_unequally(tolerances, q, sizes, j, j)
     _fill_sparse_residual(f, w, t, moved, v, True, residual)
     is_complete = _has_complete_pattern(f, base, residual, q, moved, largest, K, pivot_sizes[: q.size])
     copy(jacobian, w.jacobian_values)
-    size = typical_size(tolerances, v)
+    sizes = _displacement_sizes(tolerances, v)
     for j in range(q.size):
-        moved[j] = displace_unequally(v[j], size, j)
+        moved[j] = _displaced_unequally(tolerances, v, sizes, j, j)
     _fill_sparse_residual(f, w, t, q, moved, False, residual)
     memory[at.HAS_DAMPING] = 0.0
     for i in range(q.size):
@@ -698,7 +710,7 @@ def _fill_sparse_tangents(f, w, tolerances, memory, t, q, v):
     if code != DONE:
         return code
     for j in range(q.size):
-        moved[j] = displace_unequally(v[j], size, j)
+        moved[j] = _displaced_unequally(tolerances, v, sizes, j, j)
     _fill_sparse_residual(f, w, t, q, moved, False, residual)
     is_complete = _has_complete_pattern(f, base, residual, v, moved, largest, D, pivot_sizes[: q.size]) and is_complete
     return DONE if is_complete else NEEDS_DENSE
