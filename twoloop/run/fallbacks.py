@@ -60,6 +60,7 @@ Array = NDArray[np.float64]
 N_CORRECTIONS = 3  # number of Newton steps that suffice to reduce errors of positions from the tolerances to rounding
 # in least-squares solutions, singular values up to this fraction of the largest count as zero (redundant rows)
 NEGLIGIBLE_RATIO = 1e-12
+MIN_INERTIA = 1e-8  # least inertia of a coordinate, relative to that of others in the same row of M or G
 UNIT_RATIO = 256.0  # units in which least-squares problems are solved are powers of this number
 MAX_RESIDUAL = 1e-8  # largest residual of the equations for v after a jump, relative to their right-hand side
 
@@ -103,6 +104,10 @@ def units_of_equations(mass: Array, rows: Array) -> Array:
     powers of UNIT_RATIO, so that scaling causes no rounding errors, and leaves ordinary masses as they are.
     """
     inertia = np.abs(np.diagonal(mass))
+    # Euler parameters have no inertia in one direction, so that one of them may have only rounding errors of inertia
+    is_linked = np.vstack([mass, rows]) != 0.0
+    largest_in_row = (is_linked * inertia).max(axis=1)
+    inertia = np.maximum(inertia, MIN_INERTIA * (is_linked * largest_in_row[:, None]).max(axis=0))
     units = np.where(inertia > 0.0, inertia, max(float(inertia.max()), 1e-300)) ** -0.5
     norms = np.linalg.norm(rows * units, axis=1)
     units = np.append(units, 1.0 / np.where(norms > 0.0, norms, 1.0))
