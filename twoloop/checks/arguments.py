@@ -295,10 +295,9 @@ def _check_each(times: Array, t0: float, t1: float, spacing: float) -> None:
     close = np.diff(times) <= spacing
     if close.any():
         where = int(np.flatnonzero(close)[0])
-        raise ValueError(
-            f"t_eval must be strictly increasing; entry {where + 1} ({float(times[where + 1])!r}) follows "
-            f"{float(times[where])!r}"
-        )
+        before, after = times[where : where + 2].tolist()
+        wanted = f"hold times more than {spacing:.2g} s apart" if after > before else "be strictly increasing"
+        raise ValueError(f"t_eval must {wanted}; entry {where + 1} ({after!r}) follows {before!r}")
     for end in (t0, t1):
         beside = (times != end) & (np.abs(times - end) <= spacing)
         if beside.any():
