@@ -523,10 +523,10 @@ class CollocationCode:
         num.store(builder.extract(factors, 1), work, mem.FACTOR_OF_ERROR)
 
     def find_defect(self, emit: LaneEmitter, work: Value, state: Value, numbers: Value) -> Value:
-        """Write code for the largest defect halfway between nodes, relative to the allowed defect; return this ratio.
+        """Write code for the largest |deviation of accelerations from the equations| / limit, halfway between nodes.
 
-        The result is INVALID if pivots are too small, or accelerations are not finite. The code also stores
-        FACTOR_OF_DEFECT, the largest ratio of the next step size to the present one that the defect allows.
+        Return this ratio; INVALID if pivots are too small or accelerations are not finite. The limit is ALLOWED_DEFECT
+        * (tolerance of the velocity) / h. The code stores FACTOR_OF_DEFECT: the largest allowed (next h) / h.
         """
         builder, num, n = emit.builder, Emitter(emit.builder), self.n
         emit.numbers = emit.constants = numbers
@@ -673,7 +673,7 @@ class CollocationCode:
         self._store_largest_move(emit, work, [load_lanes(emit, moved, LANES * k) for k in range(self.n)], is_valid)
 
     def _end_offsets(self) -> dict[str, int]:
-        """Return offsets in `work` of the arrays for the ends of eight steps; keys: "q", "v", "a" and "lam"."""
+        """Return the offset in `work` of each array "q", "v", "a", "lam": the ends of eight steps, one in each lane."""
         return {
             "q": self.end_offset + LANES,
             "v": self.end_offset + LANES * (1 + self.n),

@@ -343,7 +343,7 @@ class SplitFunctions:
         return is_valid
 
     def _stack_arrays(self, emit: Emitter) -> list[Value]:
-        """Return pointers to four arrays, for stored quantities, right-hand sides r and c, and a change of v or lam."""
+        """Return four arrays: for factors of M a + G^T lam = r, G a = c; for r; for c; for lam, or a change of v."""
         sizes = self.solution.n_stored, self.n, self.n_rows, max(self.n, self.n_rows)
         return [_stack_array(emit, size) for size in sizes]
 

@@ -1,9 +1,9 @@
 """Write code in which each value is a vector with one number for each SIMD lane, and code for Taylor series in lanes.
 
-A Taylor series is computed order by order, with recurrences: coefficient k of a product of two series X and Y is the
-sum of X[j] Y[k - j] over 0 <= j <= k. The series X and Y are called factors. Their coefficients are stored in rows: the
-row of order k contains coefficient k of every factor. A factor that several products share is stored once.
-Usually each lane has its own run. In collocation steps, each lane has one stage of the same run.
+A Taylor series is computed order by order, by recurrences with sums: coefficient k of a product X Y of two series is
+the sum of X[j] Y[k - j] over 0 <= j <= k. Here a "factor" is such a series X or Y; it is stored once, even if it occurs
+in several sums. A "row" is a part of the memory: row k contains coefficient k of every factor. Usually each lane has
+its own run. In collocation steps, each lane has one stage of the same run.
 """
 
 from collections.abc import Iterator, Sequence
@@ -102,8 +102,7 @@ class LaneEmitter(Emitter):
 def load_lanes(emit: LaneEmitter, base: Value, index: int = 0) -> Value:
     """Return the vector base[index : index + STAGES]: one number for each stage of a collocation step.
 
-    The address must be aligned to the size of the vector. Loading is slow if the numbers have just been stored one by
-    one: the processor waits until all are stored.
+    The address must be aligned to the vector's size. Loading waits if the numbers have just been stored one by one.
     """
     start, kind = emit.builder.advance(base, integer(index)), vector_of(DOUBLE, STAGES)
     return emit.builder.load(emit.builder.convert("bitcast", start, f"{kind}*"), 8 * STAGES)
@@ -236,19 +235,19 @@ class LaneSeries:
         return operations
 
     def _factor_index(self, *key: Any) -> int:
-        """Return the index at which each row stores the coefficient of a factor; a new factor gets the next index.
+        """Return the index of a series that is a factor of products: row k stores its coefficient k at this index.
 
-        `key`: (terms, constant) of the factor; or ("scaled", terms, constant): then rows store order * coefficient.
+        `key`, new or known: (terms, constant) of the series; or ("scaled", terms, constant) to store k * coefficient k.
         """
         return self.factor_indices.setdefault(key, len(self.factor_indices))
 
     def _shared_sums(self) -> dict[int, tuple[int, int]]:
-        """Find products (cos x) x' and (sin x) x', whose coefficients the recurrences of sin x and cos x yield, too.
+        """Find products (cos x) x' and (sin x) x': the recurrences of sin x and cos x already compute their sums.
 
-        (cos x) x' is the derivative of sin x. So the sum in the recurrence of sin x for order k + 1, divided by the
-        unit of time, is coefficient k of (cos x) x', except for one term. This term contains coefficient k of x', which
-        is not known yet. The same holds for (sin x) x' and cos x. Keys of the returned dict: indices of the quantities
-        (cos x) x' or (sin x) x'; values: indices of the two factors in the recurrence of the sine or cosine.
+        (cos x) x' is the derivative of sin x. So the sum for coefficient k + 1 of sin x, divided by the unit of time,
+        is coefficient k of (cos x) x', except for the term that contains coefficient k of x', which is not known yet.
+        The same holds for (sin x) x' and cos x. Keys of the returned dict: index of the product among all quantities;
+        values: (index of X, index of Y) for the series X and Y in the sum of sin x or cos x, see `_factor_index`.
         """
         pairs: dict[Any, tuple[int, int]] = {}
         for operation in self.early:
@@ -262,7 +261,7 @@ class LaneSeries:
         return {result: pair for result, pair in pair_of.items() if pair is not None}
 
     def _factors(self, operation: Operation) -> list[tuple[int, int]]:
-        """Return indices of factors X and Y for each result, whose recurrence contains the sum of X[j] Y[k - j]."""
+        """Return (index of X, index of Y) for each result whose coefficient k needs a sum of X[j] Y[k - j]."""
         kind, results, first, second = operation
         if results[0] in self._carried_sums:
             return []
@@ -290,7 +289,7 @@ class LaneSeries:
             emit.store(quantities.sum(*expr), scratch, self.rhs_offset + index)
 
     def write_order(self, emit: LaneEmitter, k: Value, unit: Value, out: Value, scratch: Value) -> None:
-        """Write code that stores Taylor coefficient k + 1 of q in `out`, and k > 0 of all factors in `scratch`.
+        """Write code for k > 0: store coefficient k + 1 of q in `out`, coefficient k of products' factors in `scratch`.
 
         `unit`: unit of time of the series (s). The code first solves for coefficient k - 1 of the accelerations.
         """
@@ -345,7 +344,7 @@ class LaneSeries:
     def _write_order_0(
         self, emit: LaneEmitter, quantities: Quantities, operations: list[Operation], row: "_Row", scratch: Value
     ) -> None:
-        """Write code for Taylor coefficient 0 of the results of `operations`; store that of factors in `row`."""
+        """Write code for coefficient 0 of arguments and results of `operations`; store those used by sums in `row`."""
         one, zero = emit.constant(1.0), emit.constant(0.0)
         for operation in operations:
             kind, results, first, second = operation
@@ -381,11 +380,11 @@ class LaneSeries:
                 row.store((((result, 1.0),), 0.0), value, "if used")
 
     def _write_sums(self, emit: LaneEmitter, scratch: Value, k: Value) -> dict[tuple[tuple[int, int], bool], Value]:
-        """Write loops that add up products of coefficients of series: X[j] Y[k - j] or X[j] Y[k + 1 - j], 1 < j < k.
+        """Write loops for sums over 1 < j < k, and return the sums: of X[j] Y[k - j], and of X[j] Y[k + 1 - j].
 
-        Keys of the returned dict: ((index of factor X, index of factor Y), True for Y[k + 1 - j]); values: the sums.
-        The terms j = 1 and j = k need the newest coefficients: `_PartialSums` adds them later, so that the loops do not
-        wait for these coefficients. One loop computes several sums, and loads each row only once.
+        Keys of the returned dict: ((index of X, index of Y), True for Y[k + 1 - j] or False for Y[k - j]). For these
+        indices of series X and Y see `_factor_index`. `_PartialSums` adds the terms j = 1 and j = k later, as they need
+        the newest coefficients, for which the loops would wait. One loop computes several sums, to load data only once.
         """
         keys = [(pair, True) for pair in self.carried_pairs]
         pairs = {pair for each in (*self.early, *self.late) for pair in self._factors(each)}
@@ -488,20 +487,20 @@ class _Row:
 
 
 class _PartialSums(NamedTuple):
-    """Sums of X[j] Y[k - j] over 1 < j < k, and the rows from which to add the missing terms for j = 1 and j = k."""
+    """Sums over 1 < j < k of products of coefficients of series X and Y; methods add the terms for j = 1 and j = k."""
 
-    sums: dict[tuple[tuple[int, int], bool], Value]  # keys: (indices of factors X and Y, True for order k + 1)
+    sums: dict[tuple[tuple[int, int], bool], Value]  # result of `LaneSeries._write_sums`
     first_row: Value  # pointer to `row_1`; if k is 1, to a row of zeros, so that products with it are 0
-    row_1: Value  # pointer to the row that contains coefficient 1 of each factor
-    row_before: _Row  # row that contains coefficient k - 1 of each factor
+    row_1: Value  # pointer to coefficient 1 of all series
+    row_before: _Row  # memory that contains coefficient k - 1 of all series
 
     def sum_of_order(self, pair: tuple[int, int]) -> Value:
-        """Return the sum of X[j] Y[k - j] over 0 < j < k; `pair`: indices of the factors X and Y."""
+        """Return the sum of X[j] Y[k - j] over 0 < j < k; `pair`: indices of the series X and Y in rows."""
         emit, (x, y) = self.row_before.emit, pair
         return self.sums[pair, False] + emit.load(self.first_row, x) * self.row_before.load(y)
 
     def sum_of_next_order(self, pair: tuple[int, int], row: _Row) -> Value:
-        """Return the sum of X[j] Y[k + 1 - j] over 0 < j <= k; `pair`: indices of X and Y; `row`: row of order k."""
+        """Return the sum of X[j] Y[k + 1 - j] over 0 < j <= k; `pair`: indices of X and Y; `row`: coefficients k."""
         emit, (x, y) = self.row_before.emit, pair
         total = self.sums[pair, True] + row.load(x) * emit.load(self.first_row, y)
         return total + emit.load(self.row_1, x) * row.load(y)

@@ -103,9 +103,10 @@ def _first_step_size(state, n, t, span, smallest):
 
 @exact
 def _set_step_limits(control, tolerances, t, t1, longest, within):
-    """Store limits of step sizes and samples; forces are evaluated at least every MAX_GAP_RATIO * (t1 - t) seconds.
+    """Store limits: longest step; longest time between evaluations of the equations, and between samples of forces.
 
-    If the method adds evaluations within steps (`within`), the step size is limited only by `longest` (s).
+    Evaluations are at most MAX_GAP_RATIO * (t1 - t) s apart, which also limits the step size. If the method adds
+    evaluations within long steps (`within` is True), only `longest` (s) limits the step size.
     """
     max_gap = max(MAX_GAP_RATIO * (t1 - t), MIN_GAP * np.spacing(max(abs(t), abs(t1))))
     tolerances[GAP], tolerances[DEFECT_GAP] = max_gap, max_gap / (GAP_RATIO if control[at.BY_STATE] > 0.0 else 1.0)
@@ -402,8 +403,8 @@ def _write_report(w, b, region, n_rows, n_steps, code, is_new):
 def start_and_advance(f, checked_kit, w, b, t, t1, q, v, records, region, checks):
     """Start a run from t to t1, and take the first steps; return the number of steps, or a code such as REFUSED.
 
-    If successive runs begin at the same start, the second one saves all data computed there, and later ones restore
-    these data without a check. For the arguments see _start_run and _write_report.
+    If several runs in succession begin at the same start, the second run saves all data computed at the start. Later
+    runs restore these data, and do not check the start again. For the arguments see _start_run and _write_report.
     """
     f.form = int(b.constants[EQUATION_FORM])  # the previous run may have changed the form of the linear equations
     is_repeated, n_equal = _equals_last_start(b.last_start, t, t1, q, v), b.last_start[N_EQUAL]

@@ -24,8 +24,8 @@ MAX_VELOCITY_ROUNDING = 10.0
 # pivot ratio: smallest / largest pivot of the constraint Jacobian at a position, see min_pivot_ratio in partition.py
 SINGULAR_PIVOT_RATIO = 0.01  # a position is singular below this part of the larger pivot ratio at the interval's ends
 SINGULAR_PIVOT = 1e-5  # a position is singular if its pivot ratio is below this
-# a position with a pivot ratio below WEAK_PIVOT is singular if v before the projection violated the constraints by less
-# than MAX_VIOLATION tolerances, so that rounding may explain the change of v; estimate: (pivot ratio) * (change of v)
+# a position with a pivot ratio (smallest / largest pivot) below WEAK_PIVOT is singular if its projection has removed a
+# constraint violation of v, about (pivot ratio) * (change of v), below MAX_VIOLATION tolerances, which may be rounding
 MAX_VIOLATION, WEAK_PIVOT = 10.0, 0.05
 
 

@@ -160,11 +160,11 @@ class CachedIntegrator:
         time_limit: float | None,
         interrupts: Interrupts,
     ) -> dict[str, Any] | RepeatRequest | None:
-        """Integrate a system from a start, if possible by one call of compiled code; return the fields of the result.
+        """Integrate a system from a start, if possible by one call of compiled code; return one of three results.
 
-        After one call, the fields are `status` and `later`, a function that computes other fields when they are read.
-        Return a RepeatRequest if the run may have missed short changes of forces. Return None if the start needs more
-        checks, or if a callback raised an exception: `set_up`, called next, does these checks, and names the problem.
+        A dict: fields of the result; `later` is a function that computes other fields when they are read. A
+        RepeatRequest: the run may have missed short changes of forces. None: the start needs more checks, or a callback
+        has raised an exception; `set_up`, called next by the caller, checks the start and names the problem.
         """
         run, region, arrays, loops, parametric = self.run, self.region, self.arrays, self.loops, self.parametric
         is_due = region.is_comparison_due()
@@ -571,7 +571,6 @@ def _make_cache_entry(run: Run, code: GeneratedCode | None, t1: float, options: 
 
 
 def _trace_cache(system: ConstrainedSystem) -> TraceCache:
-    """Return the TraceCache of a system; the first call finds it by `trace_cache_of`, and the system keeps it."""
     cache: TraceCache = system.remembered(("trace cache", trace_cache_of), lambda: trace_cache_of(system))
     return cache
 

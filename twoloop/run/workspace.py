@@ -436,7 +436,7 @@ def prepare_workspace(
     """Reset the arrays of a workspace, new or used by an earlier run, for a run from q0; return the workspace."""
     arrays = map(np.ascontiguousarray, (pattern, q0))
     entry_point(cached_run().prepare_workspace)(work, *lasting_arrays(work), *arrays, max(rtol, GAMMA_ACCURACY), reuse)
-    if form is not None:  # kernels of the fixed-order form never change these arrays
+    if form is not None:  # fixed-order form: set the pattern and partition here, since its kernels never change them
         work.pattern[:], work.mass_pattern[:] = form.pattern, form.mass_pattern
         work.dependent[:] = work.independent[:] = np.arange(system.n_q)
         work.is_independent[:] = 1.0

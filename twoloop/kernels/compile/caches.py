@@ -49,7 +49,7 @@ class UntrustedFile(OSError):
 
 
 def read_trusted(path: Path) -> bytes:
-    """Return the content of a file in a folder that `trusted_folder` has returned; raise OSError if there is none.
+    """Return the content of a file in a folder from `trusted_folder`; raise OSError if the file cannot be read.
 
     If another user could have written the file, print a warning and raise UntrustedFile.
     """
@@ -97,7 +97,7 @@ def trusted_folder(folder: Path) -> Path:
 
 
 def reason_to_distrust(folder: Path) -> str:
-    """Return why another user may be able to write to a folder or a folder above it; "" if nobody is."""
+    """Return why another user may be able to write to a folder or a folder above it; "" if no other user is."""
     if os.name != "posix":  # on Windows, the mode does not contain the access rights
         return ""
     real_path = Path(os.path.realpath(folder))
@@ -108,7 +108,7 @@ def reason_to_distrust(folder: Path) -> str:
             continue
         except OSError as error:
             return f"{each} cannot be examined ({error.strerror})"
-        # all users may write to a sticky folder above it, such as /tmp, but only the owner can replace an entry
+        # all users may write to a sticky folder such as /tmp, but only its owner and a file's owner can replace a file
         is_sticky = each != real_path and status.st_mode & stat.S_ISVTX
         reason = _reason_of_owner(status) if is_sticky else _reason_of_mode(status)
         if reason:
@@ -136,7 +136,7 @@ def _reason_of_owner(status: os.stat_result) -> str:
 
 @cache
 def _is_private_group(gid: int) -> bool:
-    """Return True if only root and the user are members of a group, which is root's or the user's own."""
+    """Return True if a group is root's or the user's own group, and has no members except root and the user."""
     import grp  # not available on Windows
     import pwd
 
@@ -172,7 +172,7 @@ class CodeFiles:
     """Store the machine code of a function on disk, in one file with a checksum for each key, such as a signature.
 
     Only the user can write these files. A file counts as missing if it is damaged or out of date: written with another
-    `stamp` or version of numba. There is no index file, which several processes may spoil, as that of numba's cache.
+    `stamp` or version of numba. There is no index file, because several processes could damage it (as numba's).
     """
 
     def __init__(self, folder: Path, name: str, stamp: Any, is_limited: bool = False):
@@ -306,7 +306,7 @@ def cache_folder(package: types.ModuleType) -> Path | None:
 
 
 def give_unique_name(function: Callable[..., Any], digests: tuple[str, str] | None) -> Callable[..., Any]:
-    """Return a copy of a nested function or lambda with a unique name; return any other function unchanged.
+    """Copy a nested function or lambda with a unique name; return other functions, all if `digests` is None, unchanged.
 
     Numba names machine code by the function's qualified name and the number of functions compiled so far. So closures
     compiled by two processes may get the same name, and a process that loads both would run one code for both.

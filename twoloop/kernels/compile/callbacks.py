@@ -3,9 +3,9 @@
 The table `KINDS` determines the signature that numba compiles, the fields of `Functions` in the kernels, the methods
 and the documentation of `ConstrainedSystem`, and adapters for Python functions.
 
-If a callback computes an index, for example into a table, its machine code checks every index at every call. Without
-this check it might read memory beyond the end of an array, or crash the process. If all indices are constants or loop
-counters, there is no such check, because they are the same at every call: the first call shows whether they are valid.
+If a callback computes an index, for example into a table, its machine code checks every index at every call: an invalid
+index could read memory beyond the end of an array, or crash the process. If all indices are constants or loop counters,
+they are not checked, because they are the same at every call: the first call shows whether they are valid.
 """
 
 import ast
@@ -148,7 +148,7 @@ class CallbackKind:
 
     @property
     def optional(self) -> bool:
-        """Return True if a system may lack this callback (subject to `needed_by`)."""
+        """Return True if a system may lack this callback, unless `needed_by` requires it."""
         return self.absent != ""
 
     @cached_property
@@ -172,7 +172,6 @@ class CallbackKind:
         return self._signature(READ_ONLY_VECTOR)
 
     def _signature(self, input_type: Any) -> Any:
-        """Return the signature for input arrays of the type `input_type` and writable outputs."""
         output_types = [VECTOR if len(shape) == 1 else MATRIX for _, shape in self.outputs]
         return numba.types.void(f8, *[input_type] * len(self.state), input_type, *output_types)
 
@@ -404,9 +403,9 @@ def _compile_with_writable_inputs(
     error: Exception,
     options: dict[str, Any],
 ) -> Dispatcher:
-    """Compile a callback for writable inputs, as its helpers may not accept read-only ones, which raised `error`.
+    """Compile a callback for writable input arrays: with read-only ones, which helpers may reject, `error` was raised.
 
-    Raise TypeError if it does not compile either, or if `error` shows that the callback writes to its inputs.
+    Raise TypeError if this fails, too, or if `error` shows that the callback itself writes to its inputs.
     """
     try:
         dispatcher = compile_cached(function, KINDS[kind].signature, digests, **options)

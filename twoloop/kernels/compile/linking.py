@@ -44,7 +44,7 @@ __all__ = ["Dispatcher", "add_signature", "cgutils", "discard_compiled_code", "j
 
 
 def jitable_templates(function: Any) -> list[Any]:
-    """Return the templates by which numba compiles a `register_jitable` function anew for each caller, else []."""
+    """Return numba's templates of a `register_jitable` function, compiled anew for each caller; else return []."""
     context: Any = cpu_target.typing_context
     if not isinstance(function, FunctionType):
         return []
@@ -111,7 +111,7 @@ def _emit_element_address(
 
 _numba_call_type: Any = BaseFunction.get_call_type
 _call_signatures: dict[Any, tuple[Any, Any]] = {}
-# for the id of an object with options of numba: the object, stored so that no other object gets this id, and its text
+# keys: id of an object with options of numba; values: (object, its text); the object is kept so that its id is unique
 _option_texts: dict[int, tuple[Any, str]] = {}
 
 
@@ -123,7 +123,7 @@ def _options_text(options: Any) -> str:
 
 
 def _cached_call_type(self: Any, context: Any, args: Any, kws: Any) -> Any:
-    """Return numba's signature of a call from a cache: a tenth of the time of compilation would be spent on it."""
+    """Return numba's signature of a call; the cache of signatures saves a tenth of the time of compilation."""
     key = self, args, tuple(kws.items()), _options_text(ConfigStack.top_or_none())
     if key not in _call_signatures:
         signature = _numba_call_type(self, context, args, kws)
@@ -286,8 +286,6 @@ class _KernelLibrary(JITCodeLibrary):
 
 
 class _VectorizedLibrary(_KernelLibrary):
-    """Machine code of a kernel with long loops, which LLVM unrolls and vectorises."""
-
     vectorized = True
 
 

@@ -93,7 +93,7 @@ def _allowed_error(f, w, tolerances, v, row):
 
 @compiled
 def unexplained_velocity_change(tolerances, h, state, new_state, n):
-    """Return the largest difference, in tolerances, of a velocity's change in a step from h * (mean acceleration)."""
+    """Return the largest |(change of a velocity in a step) - h * (mean acceleration)|, in tolerances."""
     largest = 0.0
     for m in range(n):
         v, v1, a, a1 = state[n + m], new_state[n + m], state[2 * n + m], new_state[2 * n + m]
@@ -104,7 +104,7 @@ def unexplained_velocity_change(tolerances, h, state, new_state, n):
 
 @compiled
 def locate_discontinuity(f, w, t, end, q, v, velocity, tolerances):
-    """Search the least smooth of C_t and b from t to `end`; return SMOOTH, RAMP or JUMP, and two times (s).
+    """Search the least smooth component of (C_t, b) from t to `end`; return SMOOTH, RAMP or JUMP, and two times (s).
 
     The times are the ends of the jump or ramp; t and `end` if all is smooth. If a ramp fills the time span, return the
     ends of its first half: a method that evaluates accelerations only at the ends of a ramp, where they may be
@@ -252,7 +252,10 @@ def _first_sudden_bend(values, n, detrends, min_range):
 
 @compiled
 def _is_sudden_change(previous, first_value, second_value, following, limit):
-    """Return True if the middle two of four samples differ by more than `limit`, and more than other neighbours."""
+    """Return True if `second_value` differs from `first_value` by more than `limit`, and much more than nearby samples.
+
+    The change must exceed MIN_STEEPNESS_RATIO times the changes in its direction, from `previous` and to `following`.
+    """
     change = second_value - first_value
     sign = 1.0 if change > 0.0 else -1.0
     neighbouring_change = max(sign * (first_value - previous), sign * (following - second_value))
@@ -279,7 +282,7 @@ def _locate_change(f, w, low, high, k, j, q, v, a):
 def _record_changes(f, w, tolerances, clock, t, begin, spacing, n, index, column, limit, q, v, a):
     """Record sudden changes just before and after sample `index`, where a force, C_t or b has a sudden bend.
 
-    Store the time of the last change in clock[LAST_CHANGE], the shortest time between two in clock[SHORTEST_CHANGE].
+    Store the last change's time in clock[LAST_CHANGE], the shortest time between changes in clock[SHORTEST_CHANGE].
     Samples k = 0 to n, at begin + k * spacing, are in this `column` of w.changes. Changes up to `limit` are not sudden.
     """
     values, margin = w.changes[:, column], max(CHANGE_MARGIN * spacing, EQUAL_CHANGES * clock[at.WIDEST_SAMPLING])
@@ -364,10 +367,10 @@ def _record_short_change(f, w, tolerances, control, clock, t, size, last, q, v, 
 
 @compiled
 def _acceleration_lasts(f, w, tolerances, t, duration, q, v, a, Q, V, A):
-    """Return True if accelerations hardly change when velocities change by their tolerances.
+    """Return True if the accelerations a last, so that the motion can be extrapolated with them over `duration` (s).
 
-    If stiff friction holds a body, they change much: the accelerations are rounding errors of balanced forces, and
-    must not be used to extrapolate the motion over `duration` (s). (Q, V, A) is scratch.
+    They last if they hardly change when velocities change by a * `duration` or, if less, by their tolerances. If stiff
+    friction holds a body, a contains only rounding errors of balanced forces, and does not last. (Q, V, A) is scratch.
     """
     n, time, largest, change = w.Q.size, duration, 0.0, 0.0
     for m in range(n):

@@ -1,15 +1,15 @@
 """Combine two methods in one run: an explicit one, and an implicit one for stiff parts of the motion.
 
 The largest rate of the motion, rho (1/s), is the larger of two numbers: the square root of the largest eigenvalue of
-dF/dq, and the largest eigenvalue of dF/dv, where F(q, v) are the accelerations. From time to time, a few power
-iterations of one evaluation each estimate rho. Let h be the step size. If h rho is well below the stability limit of
+dF/dq, and the largest eigenvalue of dF/dv, where F(q, v) are the accelerations. From time to time, rho is estimated by
+a few power iterations; each costs one evaluation. Let h be the step size. If h rho is well below the stability limit of
 the explicit method, the motion is not stiff. Near the limit, either stiffness or accuracy may determine h. Then a trial
 begins: the implicit method takes some steps, with its errors multiplied by ten, and stays if it costs less per second.
 
 A trial also begins at smaller h rho in three cases:
 
 - rho is far above the rate at which the motion changes: a component that decays at the rate rho may limit h;
-- vibrations at the rate rho have velocities of a few tolerances at most: steps at the stability limit excite them;
+- velocities of vibrations at the rate rho are a few tolerances at most: steps at the limit cause such vibrations;
 - the whole run is expected to cost a thousand times as much as a trial.
 
 Unless h rho is far above the limit, a trial waits until the run has cost a few times as much as a trial, or is expected

@@ -262,8 +262,8 @@ def choose_rows(f, w, t, q):
 # entry j of the diagonal matrix W, which makes the equations in the module docstring regular, is this fraction of the
 # sum of squares of column j of C_q
 REGULARIZATION = 1e-11
-CONVERGED_RESIDUAL = 1e-14  # multipliers are refined until the error of reactions is this fraction of the largest one
-MAX_RESIDUAL = 1e-9  # if refinements help no more, the error of reactions may be this fraction of the largest reaction
+CONVERGED_RESIDUAL = 1e-14  # multipliers are refined until (error of reactions) / (largest reaction) is at most this
+MAX_RESIDUAL = 1e-9  # if refinements help no more, (error of reactions) / (largest reaction) may be up to this
 MAX_SOLUTIONS = 30  # largest number of refinements of the multipliers of least norm
 
 

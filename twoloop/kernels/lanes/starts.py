@@ -99,7 +99,7 @@ def _cholesky(work, pattern, n_rows, n_redundant, row, factors, shift):
 
 @compiled
 def factor_gram(work, pattern, moves, n_rows, n_redundant, G, row, factors):
-    """Prepare the least changes that satisfy linear equations with the constraint Jacobian G, in each lane.
+    """In each lane, factor the matrices for solving G x = c with the least |x|, where G is the constraint Jacobian.
 
     Store in `factors`: G with columns of fixed coordinates (`moves` = 0) set to zero and rows scaled to norm 1; the
     reciprocals of the norms; the Cholesky factor of G G^T + DIAGONAL_SHIFT I + Z^T Z; and Z, the combinations of rows

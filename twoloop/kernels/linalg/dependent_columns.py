@@ -51,9 +51,11 @@ def _find_constant_pivot(R, K, columns, row_active, row_sizes, column_sizes):
 
 @compiled
 def _is_pivot_block(R, block_columns, squared_norms, i, k, j, l, max_squares, min_sine_square):
-    """Return True if rows i, k and columns j, l of R meet both limits of a pivot block; single pivot: i == k, j == l.
+    """Return True if rows i, k and columns j, l of R can be a pivot block; for a single pivot, i == k and j == l.
 
-    `block_columns`: columns of the entries of rows i and k. `squared_norms`: of columns of G. Limits: see MAX_SQUARES.
+    The sum of squared coefficients must be below `max_squares`, and the squared sine of the angle between the columns
+    above `min_sine_square`, see MAX_SQUARES. `block_columns`: columns in which row i or k has an entry;
+    `squared_norms`: squared norm of each column of G.
     """
     total = 0.0
     if i == k:
@@ -155,7 +157,7 @@ def _subtract_multiple(R, K, columns, row_sizes, column_sizes, union, r, j, i):
 
 @compiled
 def _eliminate(R, K, columns, row_active, row_sizes, column_sizes, union, i, k, j, l):
-    """Solve rows i, k of a pivot block for the coordinates of columns j, l; eliminate these in rows without a pivot."""
+    """Solve rows i, k of a pivot block for the coordinates j, l; eliminate these from all rows without a pivot yet."""
     row_active[i] = row_active[k] = 0
     n, is_single = _merge_columns(columns, row_sizes, i, k, union), i == k
     a, b, c, d = R[i, j], R[i, l], R[k, j], R[k, l]

@@ -201,7 +201,7 @@ def _eigenvalue_bounds(mass):
 
 @compiled
 def _count_weak_eigenvalues(mass, weak_ratio, A):
-    """Count eigenvalues of the mass matrix M below z = weak_ratio * (bound of all); store factors of M - z I in A."""
+    """Count eigenvalues of the mass matrix M up to z = weak_ratio * (upper bound); store factors of M - z I in A."""
     _, largest = _eigenvalue_bounds(mass)
     copy_matrix(mass, A)
     for i in range(len(mass)):
@@ -241,9 +241,9 @@ def _removes_weak_eigenvalue(A, g, scale, x):
 def _add_rows_to_mass(mass, G, weak_ratio, scale, A, x, order, added):
     """Add scale * g^T g to the mass matrix M, for some rows g of G, until all its eigenvalues are large enough.
 
-    They must exceed `weak_ratio` times the largest. Rows are tried in the sequence of `order`; on return, -1 replaces
-    added rows in it. Store the indices of added rows in `added`; return their number, or STAYS_SINGULAR if eigenvalues
-    are still too small and no further row helps.
+    All eigenvalues must exceed `weak_ratio` times an upper bound of the largest. Rows are tried in the sequence of
+    `order`; on return, -1 replaces added rows in `order`. Store the indices of added rows in `added`; return their
+    number, or STAYS_SINGULAR if eigenvalues are still too small and no further row helps.
     """
     n_added = 0
     while _count_weak_eigenvalues(mass, weak_ratio, A) > 0:

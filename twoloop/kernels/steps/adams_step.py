@@ -96,7 +96,7 @@ def _difference_table(memory, n, index):
 
 @inlined
 def _scratch_rows(memory, n):
-    """Return two scratch rows (n, padded), for v and for q: mean accelerations, later 1 / (allowed errors)."""
+    """Return scratch rows x, y (n, padded): v + h x, q + h (v + h y) predict a step h; later 1 / (allowed errors)."""
     width = (n + 3) // 4 * 4
     start = N_SCALARS + N_ROWS * (N_TERMS + 2) + 2 * (N_TERMS + 1) * width
     return memory[start : start + width], memory[start + width : start + 2 * width]

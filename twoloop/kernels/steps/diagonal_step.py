@@ -192,7 +192,7 @@ VELOCITY_WEIGHT = 0.1  # weight, in Newton's convergence test, of the effect tha
 
 @inlined
 def stage_views(memory, s, n):
-    """Return views of `memory`: stage velocities (s, n), stage accelerations (s, n), accelerations (n) at the start."""
+    """Return stage velocities (s, n), stage accelerations (s, n), start accelerations of the step (n), in `memory`."""
     last = memory.size - n
     return (
         memory[last - 2 * s * n : last - s * n].reshape((s, n)),
