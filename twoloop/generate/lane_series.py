@@ -45,7 +45,7 @@ class LaneEmitter(Emitter):
         super().__init__(builder, lanes)
 
     def coefficient(self, number: float) -> Value:
-        """Return `number` in all lanes. Load a Coefficient: a vector if it varies between lanes, else one number."""
+        """Return `number` in all lanes; load a Coefficient: a vector if it varies between lanes, else a number."""
         if not isinstance(number, Coefficient) or number.varies:
             return super().coefficient(number)
         pointer = self.builder.advance(self.constants, integer(number.index))
@@ -242,7 +242,7 @@ class LaneSeries:
         return self.factor_indices.setdefault(key, len(self.factor_indices))
 
     def _shared_sums(self) -> dict[int, tuple[int, int]]:
-        """Find products (cos x) x' and (sin x) x': the recurrences of sin x and cos x already compute their sums.
+        """Find products (cos x) x' and (sin x) x', whose sums the recurrences of sin x and cos x already compute.
 
         (cos x) x' is the derivative of sin x. So the sum for coefficient k + 1 of sin x, divided by the unit of time,
         is coefficient k of (cos x) x', except for the term that contains coefficient k of x', which is not known yet.

@@ -298,7 +298,7 @@ class CachedIntegrator:
         return self.parametric is None or self.parametric.callbacks_agree(run.t0, q0, v0, t1, mass, derivatives)
 
     def _use_independent_rows(self, rows: bytes) -> None:
-        """Set the run's redundant rows and the warning of these; `rows`: indices of independent rows, as bytes."""
+        """Set the run's redundant rows and the warning about them; `rows`: indices of independent rows, as bytes."""
         run = self.run
         run.redundant, run.rows_warning = self.redundancy[rows]
         self.run_fields, self.independent_rows = (run.rank, run.redundant, self.run_fields[-1]), rows

@@ -172,7 +172,7 @@ class CodeFiles:
     """Store the machine code of a function on disk, in one file with a checksum for each key, such as a signature.
 
     Only the user can write these files. A file counts as missing if it is damaged or out of date: written with another
-    `stamp` or version of numba. There is no index file, because several processes could damage it (as numba's).
+    `stamp` or version of numba. There is no index file like numba's, which several processes may damage.
     """
 
     def __init__(self, folder: Path, name: str, stamp: Any, is_limited: bool = False):
@@ -306,10 +306,10 @@ def cache_folder(package: types.ModuleType) -> Path | None:
 
 
 def give_unique_name(function: Callable[..., Any], digests: tuple[str, str] | None) -> Callable[..., Any]:
-    """Copy a nested function or lambda with a unique name; return other functions, all if `digests` is None, unchanged.
+    """Return a copy of a nested function or lambda, with a unique name; return any other function itself.
 
-    Numba names machine code by the function's qualified name and the number of functions compiled so far. So closures
-    compiled by two processes may get the same name, and a process that loads both would run one code for both.
+    Numba names code by the function's qualified name and a counter: closures compiled by two processes may get the same
+    name, and a process that loads both would run one code for both. If `digests` is None (no files), nothing is copied.
     """
     if digests is None or "<" not in function.__qualname__:
         return function
@@ -383,7 +383,7 @@ def compiled_when_called(**options: Any) -> Callable[[Callable[..., Any]], Dispa
         digests = digests_of(function)
         dispatcher = njit(**options)(give_unique_name(function, digests))
         if digests is not None:
-            # for `_use_twoloop_cache`, which recompiles this function if a callback calls it and its digests differ
+            # for `_use_twoloop_cache`, which recompiles this function if a callback calls it and its digests changed
             _COMPILED_DIGESTS[dispatcher] = digests
             with suppress(RuntimeError):  # if no folder can be written, do not store machine code
                 dispatcher._cache = _CodeCache(dispatcher.py_func, *digests, "")

@@ -302,8 +302,8 @@ def callback(kind: str, allocates: bool = True) -> Callable[[Callable[..., None]
     """Compile a callback of a mechanism with the signature of its kind.
 
     The arguments are the time, the coordinates `q` (n_q,), in some kinds the velocities `v` (n_q,) or the multipliers
-    `lam` (n_c,), the parameters `p`, and the array to fill, which contains zeros at first. Add to this array (to a
-    derivative of forces, if the system has a `bandwidth`, only within the band), and write to no other array::
+    `lam` (n_c,), the parameters `p`, and the array to fill, which contains zeros at first. Add to this array, and
+    write to no other. If the system has a `bandwidth`, add to a derivative of forces only within the band::
 
         @callback("jacobian")
         def jacobian(t, q, p, Cq):
@@ -403,9 +403,9 @@ def _compile_with_writable_inputs(
     error: Exception,
     options: dict[str, Any],
 ) -> Dispatcher:
-    """Compile a callback for writable input arrays: with read-only ones, which helpers may reject, `error` was raised.
+    """Compile a callback for writable input arrays, because its compilation for read-only ones raised `error`.
 
-    Raise TypeError if this fails, too, or if `error` shows that the callback itself writes to its inputs.
+    Raise TypeError if this fails, too, or if `error` does not show that only a helper rejects read-only arrays.
     """
     try:
         dispatcher = compile_cached(function, KINDS[kind].signature, digests, **options)

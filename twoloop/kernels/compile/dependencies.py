@@ -212,7 +212,7 @@ class _LoadedName(NamedTuple):
 
 
 def frozen_values(compiled: Any, function: Any = None) -> list[tuple[FrozenValue, bytes | None]]:
-    """Return the values that are part of a function's machine code, as pairs: (value, its bytes; None: not an array).
+    """Return the values that are part of a function's machine code, as pairs: (value, bytes of an array or None).
 
     The first call, just after the compilation, stores the list in an attribute of `compiled`, so that later comparisons
     show whether a value has changed. `function`: the original function, if a copy of it was compiled.
@@ -248,7 +248,7 @@ def frozen_locations(function: Any, seen: set[int] | None = None) -> Iterator[Fr
 
 
 def python_function(value: Any) -> FunctionType | None:
-    """Return the Python function that `njit`, `vectorize` etc. have compiled to `value`; None if it is not compiled."""
+    """Return the Python function that `njit`, `vectorize` etc. have compiled to `value`, or None for other values."""
     if isinstance(value, Dispatcher):
         return value.py_func  # type: ignore[no-any-return]
     if isinstance(value, FunctionType):
@@ -345,7 +345,7 @@ class FunctionCopier:
         self.copies: dict[Any, Any] = {}  # replacements, by id of the original
 
     def replacement_of(self, value: Any, names: frozenset[str] = frozenset()) -> Any:
-        """Return a helper's replacement, a tuple or module (attributes `names`) with such replacements, or `value`."""
+        """Return a helper's replacement, a tuple or module (its `names`) with such replacements, or `value` itself."""
         if self.is_copied(value):
             if id(value) not in self.copies:
                 self._add_copy(value)

@@ -44,7 +44,7 @@ __all__ = ["Dispatcher", "add_signature", "cgutils", "discard_compiled_code", "j
 
 
 def jitable_templates(function: Any) -> list[Any]:
-    """Return numba's templates of a `register_jitable` function, compiled anew for each caller; else return []."""
+    """Return numba's templates (typing rules) of a function decorated by `register_jitable`; [] for other values."""
     context: Any = cpu_target.typing_context
     if not isinstance(function, FunctionType):
         return []

@@ -174,7 +174,7 @@ MIN_STEEPNESS_RATIO = 2.0  # a change between two samples is sudden if it exceed
 SHORT_STEP = 0.5  # steps below this fraction of the longest recent step are searched for pulses of forces, C_t and b
 N_SAMPLES_IN_SHORT_STEP = 4  # number of samples within a short step, in search of pulses
 # accelerations do not last if one of them changes by more than this fraction of the largest, when velocities change by
-# their tolerances, see `_acceleration_lasts`
+# their tolerances at most, see `_acceleration_lasts`
 MAX_LASTING_CHANGE = 0.5
 # a step need not end at a change if the step begins before it by at most this fraction of the time between samples
 CHANGE_MARGIN = 0.01

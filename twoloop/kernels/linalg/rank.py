@@ -201,7 +201,7 @@ def _eigenvalue_bounds(mass):
 
 @compiled
 def _count_weak_eigenvalues(mass, weak_ratio, A):
-    """Count eigenvalues of the mass matrix M up to z = weak_ratio * (upper bound); store factors of M - z I in A."""
+    """Count eigenvalues of M = `mass` up to z = weak_ratio * (their upper bound); store factors of M - z I in A."""
     _, largest = _eigenvalue_bounds(mass)
     copy_matrix(mass, A)
     for i in range(len(mass)):
@@ -418,8 +418,8 @@ def _first_bound_below_pivots(S, kept, n_kept, largest_inverse, bounds, scratch)
 def _mark_independent_rows(G, min_sine, basis, factors, coefficients, C, kept, is_kept):
     """Set `is_kept` to 1 for the rows of G that `select_rows` selects, else to 0: these are redundant.
 
-    C[i, k] becomes the coefficient of independent row k in redundant row i, both scaled to norm 1. All other arrays
-    except G are scratch.
+    C[i, k] becomes the coefficient of independent row k in redundant row i, both scaled to norm 1. The arrays
+    `basis`, `factors`, `coefficients` and `kept` are scratch.
     """
     n_kept = select_rows(G, min_sine, basis, factors, kept)
     for k in range(len(G)):
