@@ -63,7 +63,8 @@ PRESSED_RATIO = 1e3  # largest squared rate of stops that may press together, ov
 ROUNDING = 1e-13  # rounding errors of gaps and rates, relative to max(least_size, |q|)
 FIRST_STEP_RATIO = 1e-9  # smallest first step size of an arc, relative to max(1 s, t)
 MIN_TIME_LIMIT = 1e-6  # time limit, s, of an arc that begins after the time limit of the motion
-NEGLIGIBLE_POSITION = 1e-3  # a position so near to q = 0, in units of atol, is moved there
+# a position nearer to q = 0 than NEGLIGIBLE_POSITION (m or rad), and than MAX_MOVE times atol, is moved there
+NEGLIGIBLE_POSITION, MAX_MOVE = 1e-16, 1e-3
 NEGLIGIBLE_VALUE = 1e-20  # a coordinate (m or rad) or rate (m/s or rad/s) below this value is a rounding error
 ROUNDED_TIMES = 4.0  # largest rounding error of the time of an event, in spacings of floating-point numbers
 MAX_STALLED_TIME = 1e-13  # longest duration of a stalled arc, relative to max(1 s, t)
@@ -442,7 +443,7 @@ class Motion:
             self._project(system, resting)
         if self.arcs or resting:
             self.q[np.abs(self.q) < NEGLIGIBLE_VALUE] = 0.0
-            if np.abs(self.q).max() < NEGLIGIBLE_POSITION * self.options["atol"].min():
+            if np.abs(self.q).max() < min(NEGLIGIBLE_POSITION, MAX_MOVE * self.options["atol"].min()):
                 self.q[:] = 0.0  # if only some of these coordinates were zero, they might violate the constraints
             self.v[np.abs(self.v) < max(NEGLIGIBLE_VALUE, 1e-16 * float(self.speeds.max()))] = 0.0
         start = self.gaps.evaluate(self.t, self.q, self.v)
