@@ -4,12 +4,14 @@ import pickle
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from tests.marks import slow
 from tests.problems import unconstrained
 from twoloop import ConstrainedSystem, Status, Stop, load, solve_with_stops
 from twoloop.bodies import PlanarModel, SpatialModel
 from twoloop.impacts.friction import Tangents, Undetermined, coulomb_forces, impulses
+from twoloop.run.fallbacks import units_of_equations
 
 GRAVITY = 9.81
 TIGHT = {"rtol": 1e-10, "atol": 1e-10}
@@ -272,6 +274,24 @@ def test_a_light_body_beside_a_heavy_one_has_an_impact_of_its_own(heavy):
     arm, rate = -0.005 * np.cos(0.7), result.impacts[0].v_before[4]
     impulse = -1.8 * rate / (1e3 + arm**2 * 12e7)
     np.testing.assert_allclose(result.impacts[0].v_after[4:], [rate + 1e3 * impulse, 12e7 * arm * impulse], rtol=1e-9)
+
+
+@pytest.mark.parametrize("rotation", [0.0, 1e-6, np.pi])
+def test_an_impact_on_a_chain_in_space_keeps_its_joints(rotation):
+    model = SpatialModel((0.0, 0.0, -GRAVITY), name="chain")
+    for k, name in enumerate("ab"):
+        turned = Rotation.from_rotvec([rotation, 0.0, 0.0]).as_matrix()
+        model.body(name, mass=1.0, inertia=(0.1, 0.2, 0.3), position=(0.5 + k, 0.0, 0.1), rotation=turned)
+    hinge = model.revolute("ground", "a", at=(0.0, 0.0, 0.1), axis=(0.0, 1.0, 0.0))
+    model.drive(hinge, lambda t: 0.2 * t)
+    model.spherical("a", "b", at=(1.0, 0.0, 0.1))
+    model.stop("b", (1.7, 0.2, 0.1), "ground", (0.0, 0.0, 0.0), normal=(0.0, 0.0, 1.0), restitution=0.5)
+    problem, result = moved(model, 0.3)
+    hit = result.impacts[0]
+    q = result.sol(hit.t).q
+    assert np.abs(problem.system.velocity_constraint(hit.t, q, hit.v_after)).max() < 1e-9
+    units = units_of_equations(problem.system.mass(hit.t, q), problem.system.rows(hit.t, q))
+    assert np.ptp(units[3:7]) == np.ptp(units[10:14]) == 0.0  # of Euler parameters, of which one may have no inertia
 
 
 EQUAL, UNEQUAL = ([1.0] * 4, [1.0] * 3), ([1.0, 2.0, 1.5, 0.5], [0.3, 0.8, 0.2])  # masses and restitutions

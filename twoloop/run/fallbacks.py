@@ -60,7 +60,6 @@ Array = NDArray[np.float64]
 N_CORRECTIONS = 3  # number of Newton steps that suffice to reduce errors of positions from the tolerances to rounding
 # in least-squares solutions, singular values up to this fraction of the largest count as zero (redundant rows)
 NEGLIGIBLE_RATIO = 1e-12
-MIN_INERTIA = 1e-8  # least inertia of a coordinate, relative to that of others in the same row of M or G
 UNIT_RATIO = 256.0  # units in which least-squares problems are solved are powers of this number
 MAX_RESIDUAL = 1e-8  # largest residual of the equations for v after a jump, relative to their right-hand side
 
@@ -72,12 +71,16 @@ def state_after_jump(system: ConstrainedSystem, t: float, q: Array, v: Array) ->
     to v+. The equations M (v+ - v) + G^T p = 0 and G v+ + (C_t, b) = 0 are solved for v+ and p.
     """
     q = corrected_positions(system, t, q)
-    equations, units = scaled_equations(system, t, q)
-    right_side = units * np.append(np.zeros(system.n_q), -system.velocity_constraint(t, q, v))
+    mass, rows = system.mass(t, q), system.rows(t, q)
+    norms, largest = np.linalg.norm(rows, axis=1), float(np.abs(mass).max())
+    norms[norms == 0.0] = 1.0  # rows of zeros are not scaled
+    scaled = rows / norms[:, None] * largest
+    equations = np.block([[mass, scaled.T], [scaled, np.zeros((len(rows), len(rows)))]])
+    right_side = np.concatenate([np.zeros(system.n_q), -system.velocity_constraint(t, q, v) / norms * largest])
     change = np.linalg.lstsq(equations, right_side, rcond=NEGLIGIBLE_RATIO)[0]
     if not np.abs(equations @ change - right_side).max() <= MAX_RESIDUAL * np.abs(right_side).max():
         return None
-    return np.concatenate([q, v + (units * change)[: system.n_q]])
+    return np.concatenate([q, v + change[: system.n_q]])
 
 
 def corrected_positions(system: ConstrainedSystem, t: float, q: Array) -> Array:
@@ -103,12 +106,16 @@ def units_of_equations(mass: Array, rows: Array) -> Array:
     Without these units, the inertia of a small body beside a large one counts as zero (NEGLIGIBLE_RATIO). They are
     powers of UNIT_RATIO, so that scaling causes no rounding errors, and leaves ordinary masses as they are.
     """
-    inertia = np.abs(np.diagonal(mass))
-    # Euler parameters have no inertia in one direction, so that one of them may have only rounding errors of inertia
-    is_linked = np.vstack([mass, rows]) != 0.0
-    largest_in_row = (is_linked * inertia).max(axis=1)
-    inertia = np.maximum(inertia, MIN_INERTIA * (is_linked * largest_in_row[:, None]).max(axis=0))
-    units = np.where(inertia > 0.0, inertia, max(float(inertia.max()), 1e-300)) ** -0.5
+    inertia, is_coupled, is_linked = np.abs(np.diagonal(mass)), mass != 0.0, rows != 0.0
+    # the Euler parameters of a body share a unit, because in one direction, which may be one of them, they have no
+    # inertia: if its row of M has other entries, take the largest inertia; if it has none, the least of linked ones
+    has_others = is_coupled.sum(axis=1) > (inertia > 0.0)
+    inertia = np.where(has_others, (is_coupled * inertia).max(axis=1), inertia)
+    known = np.where(inertia > 0.0, inertia, np.inf)
+    least_in_row = np.where(is_linked, known, np.inf).min(axis=1)
+    least = np.where(is_linked, least_in_row[:, None], np.inf).min(axis=0, initial=np.inf)
+    least = np.where(np.isfinite(least), least, min(float(known.min()), 1e300))
+    units = np.where(inertia > 0.0, inertia, least) ** -0.5
     norms = np.linalg.norm(rows * units, axis=1)
     units = np.append(units, 1.0 / np.where(norms > 0.0, norms, 1.0))
     return UNIT_RATIO ** np.round(np.log2(units) / np.log2(UNIT_RATIO))
