@@ -50,9 +50,9 @@ def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
     """Attempt a step by fixed-point iteration; estimate its error from a step of size h and two steps of size h/2.
 
     The new state is the end of the second half step. If options[EXTRAPOLATION] is not 0, it is extrapolated from the
-    ends of the whole step and of the half steps, and projected onto the constraints. The first guess of stages is the
-    polynomial through the stage accelerations: of the last accepted step for the whole step, of the whole step for half
-    steps. If the step size is fixed, only the whole step is computed.
+    ends of the whole step and of the half steps, and projected onto the constraints. The stages of the whole step are
+    guessed by the polynomial through the stages of the last accepted step, the stages of half steps by the polynomial
+    through those of the whole step. If the step size is fixed, only the whole step is computed.
     """
     s, _, _, _, _, c = tableau_of(options)
     n = w.Q.size
@@ -115,7 +115,7 @@ SUDDEN_ERROR = 10.0  # a step is rejected if jumps of forces cause a larger erro
 
 @kernel(ATTEMPT)
 def paper_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """Attempt a step of size h as in Sects. 3.1-3.3 of the paper; estimate its error by comparison with two of h/2."""
+    """Attempt a step as in Sects. 3.1-3.3 of the paper; estimate its error by comparison with two half steps."""
     s, _, _, _, _, _ = tableau_of(options)
     n = w.Q.size
     q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]
