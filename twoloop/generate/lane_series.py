@@ -182,7 +182,7 @@ class LaneSeries:
         self.late = self._make_operations(program.late, first_result + len(program.early.first.column))
         self.rows = self._row_expressions(program.rows, program.row_indices)
         self.balance = self._row_expressions(program.balance, program.balance_indices)
-        # this dict is empty at first, because `_shared_sums`, which fills it, calls `_factors`, which reads it
+        # this dict is empty at first: `_shared_sums` returns its entries, but calls `_factors`, which reads the dict
         self._carried_sums: dict[int, tuple[int, int]] = {}
         self._carried_sums |= self._shared_sums()
         self.carried_pairs = sorted(set(self._carried_sums.values()))
@@ -247,7 +247,7 @@ class LaneSeries:
         (cos x) x' is the derivative of sin x. So the sum for coefficient k + 1 of sin x, divided by the unit of time,
         is coefficient k of (cos x) x', except for the term that contains coefficient k of x', which is not known yet.
         The sum for cos x serves for (sin x) x' in this way. In the returned dict, a key is the index of the product
-        among all quantities; the value (x, y) are the indices of the two series in the sum, see `_factor_index`.
+        among all quantities; the value (x, y) contains the indices of the two series in the sum, see `_factor_index`.
         """
         pairs: dict[Any, tuple[int, int]] = {}
         for operation in self.early:

@@ -155,7 +155,7 @@ class GrowthExponents(DegreeAlgebra):
 class DivisorDegrees(DegreeAlgebra):
     """Algebra whose values are total degrees of divisors: a product adds the degrees, a sum takes the largest one.
 
-    `degrees`: degrees of all quantities. Arguments of arctangents count as divisors, as they do in the derivatives.
+    `degrees`: degrees of all quantities. Arctangents of x count as divisions by x: their derivative is x' / (1 + x^2).
     """
 
     def __init__(self, degrees: DegreeAlgebra):

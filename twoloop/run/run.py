@@ -46,7 +46,7 @@ FIRST_CHUNK = 1024
 FIRST_CHUNK_IN_PYTHON = 64  # largest number of steps in the first chunk if callbacks are (slow) Python functions
 SMALL_SYSTEM = 32  # largest number of coordinates of a small system; chunks of larger ones are proportionally smaller
 TRIAL_STEPS = 10  # a method on trial is given up if one of this many first steps is short, see loop_state.TRIAL_STEPS
-NO_PATTERN = np.zeros((0, 0))  # given instead of the pattern of constraint rows, which FixedOrderForm contains
+NO_PATTERN = np.zeros((0, 0))  # empty argument `pattern` for the fixed-order form, which stores the pattern itself
 # constraints contradict one another if a row of G a = Gamma is violated by more than this * max(sum of |terms|, 1)
 CONTRADICTION = 1e-6
 
@@ -104,7 +104,7 @@ class Run:
         self._reset_clock(t0)
         self.write_step_control(plan)
         self.substituted = False  # whether `plan.substitute` has replaced the first plan
-        self.near_threshold = singular_threshold(rtol)  # near a singular position, smallest / largest pivot is less
+        self.near_threshold = singular_threshold(rtol)  # near a singular position, min pivot / max pivot is below this
         force_traced = any("force" in each.kinds for each in plan.traced)
         short_and_steep = system.remembered(
             ("changes", force_traced),
@@ -114,7 +114,7 @@ class Run:
         self.short_forces: ShortForces = short_forces
         self.control[[loop_state.BY_TIME, loop_state.BY_STATE]] = self.short_forces
         self.forces_may_be_steep = steep or plan.max_gap == 1.0
-        self.crossings: list[list[tuple[float, Array]]] = []  # states before and after steps across singular positions
+        self.crossings: list[list[tuple[float, Array]]] = []  # for each crossing, (t, state) before it and after it
         # the next seven attributes belong to steps across a singular position, see fallbacks.py
         self.mirrored_size = 0.0  # size (s) of a step that begins as far before a singular position as it ends beyond
         self.crossing_tolerances = self.tolerances  # tolerances of steps across singular positions
@@ -127,7 +127,7 @@ class Run:
         self.starts_singular = False  # whether the start is a singular position: C_q has a higher rank beside it
         self.branch_known = False  # whether it is known on which branch the motion leaves a singular start
         self.jumps: list[float] = []  # times (s) at which velocities jumped because C_t, or b in A v + b = 0, jumped
-        self.compared_until = [-np.inf]  # time until which callbacks were compared with traces; copies share the list
+        self.compared_until = [-np.inf]  # latest time (s) of a comparison with traces; copies of the run share the list
         self.region: CheckedRegion | None = None  # where callbacks agreed with traces; None: the system's region
         self.varied_parameters: Array | None = None  # parameters in which systems that share this run differ
         self._compute_start_accelerations()
@@ -143,7 +143,7 @@ class Run:
         return new_run
 
     def copy_to_start(self, t0: float, q0: Array, v0: Array) -> "Run | None":
-        """Return a copy of this run at another start; None if constraint ranks differ, or accelerations fail.
+        """Return a copy of this run at another start; None if ranks differ from this run's, or accelerations fail.
 
         The run must not use the fixed-order form (sparse factors in a fixed order of elimination).
         """
@@ -300,7 +300,7 @@ class Run:
             self.work = self._make_workspace(rank, rank)
             code = start(self.kit, self.work, self.t0, self.state)
         if self.fixed_order is not None and code not in (indices.DONE, indices.NOT_FINITE):
-            if self.work.notes[indices.SMALLEST] < 0.0:  # M is not definite: later runs must not try this form
+            if self.work.notes[indices.SMALLEST] < 0.0:  # M is not definite: no fixed-order form in later runs
                 self.system.derived["fixed-order form"] = None
             self.fixed_order = None
             self.kit = make_kit(self.system, self.t0, self.state[: self.system.n_q], self.plan)
@@ -336,7 +336,7 @@ class Run:
         )
 
     def find_redundant_rows(self) -> tuple[NDArray[np.int64], str]:
-        """Return indices of redundant rows at the start, and a warning; raise ValueError if constraints contradict."""
+        """Return indices of redundant rows at the start and a warning; raise ValueError for contradictory rows."""
         n_rows = self.system.n_c + self.system.n_a
         if self.rank == n_rows:
             return np.zeros(0, dtype=np.int64), ""

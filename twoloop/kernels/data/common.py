@@ -58,13 +58,13 @@ class Work(NamedTuple):
     MT: Any  # (n_q, n_dof) mass matrix times T, whose columns are the null space of the constraint Jacobian
     # null space of G: row j contains the dependent velocities (in order of elimination) if independent velocity j is 1
     # and the others are 0. Last row: dependent velocities due to drives (C_t and b) if all independent ones are 0
-    D: Any  # (n_dof + 1, r_v) dependent velocities per unit of each independent one; last row: due to drives
+    D: Any  # (n_dof + 1, r_v) dependent velocities per unit of each independent one; last row: those due to drives
     Gx: Any  # (n_c + n_a, n_q) constraint Jacobian at a displaced position; scratch for full pivoting
     G_of_S: Any  # (n_c + n_a, n_q) if M is constant: the G for which S and W were computed; NaN: S and W are invalid
     pattern: Any  # (n_c + n_a, n_q) 1 for entries of the constraint Jacobian that have been nonzero in the run, else 0
     mass_pattern: Any  # (n_q, n_q) 1 for entries of M that have been nonzero, else 0; only in the form AUGMENTED
-    row_entries: Any  # for each row of G, index in this array at which its list of nonzero columns begins; then lists
-    Gamma_tried: Any  # (2, n_c + n_a) Gamma by differences: row 0 with twice the time step, row 1 with the previous one
+    row_entries: Any  # for each row of G, index in this array at which its list of nonzero columns begins; lists follow
+    Gamma_tried: Any  # (2, n_c + n_a) Gamma by differences: row 0 with 2 * time step, row 1 with the previous time step
     rates: Any  # (13, n_c + n_a) constraint rates C_t and b at 13 times within a step, see discontinuities.py
     changes: Any  # (N_CHANGES, n_q + n_c + n_a) samples of forces and constraint rates, see discontinuities.py
     Q: Any  # (n_q) generalized forces
@@ -89,7 +89,7 @@ class Work(NamedTuple):
     values_v: Any  # factors of G_d, the dependent columns of the constraint Jacobian G
     index_a: Any  # list of operations that factors the augmented matrix [M G^T; G 0]; index_a[SIZE] = 0: no list yet
     values_a: Any  # factors of the augmented matrix; empty in other forms than AUGMENTED
-    right: Any  # (2 (n_q + r_v)) right-hand side for the augmented matrix, then as much scratch (r_v: rank of G)
+    right: Any  # (2 (n_q + r_v)) right-hand side for the augmented matrix; the second half is scratch (r_v: rank of G)
     order: Any  # (n_q) scratch: order of the columns in full pivoting
     row_order: Any  # (n_c + n_a) scratch: order of the rows in full pivoting
     counters: Any  # (N_COUNTERS) numbers of steps, iterations, evaluations etc. in the run, see indices.py
@@ -307,7 +307,7 @@ class Kit:
     `functions`: callbacks and data of the system. `own`: functions generated for the mechanism, if any. `inner`: the
     inner loop, which may call `own`. `general`: the inner loop for any mechanism, for what generated code cannot do.
     `step`: functions of the method, or None if no kernel calls them. `first`, `second`: functions of two methods
-    between which the run may switch. `numbers`, `own_numbers`: data of generated functions of a state, of collocation.
+    between which the run may switch. `numbers`, `own_numbers`: data of generated functions of states, collocation.
     """
 
     def __init__(
@@ -420,7 +420,7 @@ def smallest_size(tolerances):
 
 @merged
 def typical_size(tolerances, x):
-    """Return the typical size of x (q or v): max|x_k|, but at most 1 and at least `smallest_size`; 1 if both are zero.
+    """Return the typical size of x (q or v): max|x_k|, at least `smallest_size`, at most 1; or 1 if x and atol are 0.
 
     Smaller components count as this size. If it were 1 for a mechanism of 1e-9 m, finite differences would displace q
     by 1e-7 m, and a correction of 1e-14 m would count as rounding. As x may be rounding errors, such as velocities at
@@ -436,8 +436,8 @@ def typical_size(tolerances, x):
 def max_change_by_rounding(limit, change, change_q, change_v, size_q, size_v):
     """Return the limit up to which the relative change in an iteration, `change`, may be due to rounding.
 
-    `change` is the larger one of change_q / size_q and change_v / size_v. It may be due to rounding if change_q and
-    change_v, divided by the size, or by 1 if the size is less than 1, are at most the argument `limit`.
+    `change` is the larger one of change_q / size_q and change_v / size_v. It may be due to rounding if
+    change_q / max(size_q, 1) and change_v / max(size_v, 1) are at most the argument `limit`.
     """
     rounded = max(change_q / max(size_q, 1.0), change_v / max(size_v, 1.0))
     return limit * (change / rounded) if rounded > 0.0 else limit

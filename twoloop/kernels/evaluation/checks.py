@@ -106,8 +106,8 @@ def linear_ranges(coordinates_in_units, radius, negligible, scratch, ranges):
     """Store in `ranges` how far coordinates can move, in their units, before each row of C_q changes much.
 
     Entry (i, j) of `coordinates_in_units` is |q_j| in its unit if row i of C_q has a nonzero entry j, else 0. `radius`:
-    norm of each row / change of the row per unit displacement. If it is at most 1, or at most the largest |q_j| of the
-    row, the range is the radius. If not, the range is the lower median of the |q_j| of the row that exceed NEGLIGIBLE
+    norm of each row / change of the row per unit displacement. If the radius is at most 1, or at most the largest |q_j|
+    of the row, it is the range. If not, the range is the lower median of the |q_j| of the row that exceed NEGLIGIBLE
     times the largest one; but if no |q_j| of the row exceeds the argument `negligible`, the range is 1.
     """
     for i in range(ranges.size):

@@ -229,7 +229,7 @@ def predict_stages(settings, c, work, begins):
 
     PREVIOUS belongs to the last accepted step. If the new step size X exceeds MAX_STEP_RATIO times the size of that
     step, the polynomial would be extrapolated too far: then all predictions are the accelerations where the new step
-    begins. `begins`: 1 if the new step follows the accepted step, 0 if it is a part with the same beginning.
+    begins. `begins`: 1 if the new step follows the accepted step, 0 if it is the first part of the accepted step.
     """
     n = settings[at.N]
     memory = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])[7]
@@ -326,7 +326,7 @@ def _correct_stages(settings, method_options, s, work):
 
 @merged
 def _raise_to_largest_value(work, target, begin, n):
-    """In each lane, raise the number at `target` to the largest |value| in the n vectors at `begin`, or to a NaN."""
+    """In each lane, raise the number at `target` to the largest |value|, or a NaN, in the n vectors at `begin`."""
     for i in range(n * LANES):
         magnitude, index = abs(work[begin * LANES + i]), target * LANES + i % LANES
         if magnitude > work[index] or magnitude != magnitude:
@@ -431,7 +431,7 @@ def _allowed_error(control, work, state, new, j, entry, k):
 
 @compiled
 def _store_embedded_estimate(settings, method_options, A, work, memory):
-    """Store in E_Q and E_V the errors of q and v that the embedded formula estimates, before filters."""
+    """Store in E_Q and E_V the errors of q and v that the embedded formula estimates, without filters."""
     n, s = settings[at.N], A.shape[0]
     offset = newton_options_index(s)
     gamma0, e = method_options[offset + GAMMA0], method_options[offset + N_EIGEN_SCALARS : offset + N_EIGEN_SCALARS + s]
@@ -495,7 +495,7 @@ def _filtered_velocity_error(control, work, n, memory, z, state, new, k):
         largest_a = max(largest_a, abs(work[(begin + n + j) * LANES + k]))
         largest_error = max(largest_error, abs(work[(twice + j) * LANES + k]))
         difference = work[(twice + j) * LANES + k] - 2.0 * work[(once + j) * LANES + k] + work[(raw + j) * LANES + k]
-        largest_difference = max(largest_difference, abs(difference))  # in (z J)^2 E_V, see `_filter_errors`
+        largest_difference = max(largest_difference, abs(difference))  # max|(z J)^2 E_V|, see `_filter_errors`
     if largest_error > 0.0:
         work[(memory + DURATION) * LANES + k] = z * np.sqrt(largest_error / largest_difference)
     duration = work[(memory + DURATION) * LANES + k]

@@ -310,7 +310,7 @@ def _gauss_newton(code, settings, control, pattern, moves, work):
                 continue
             for j in range(n):
                 work[(new + j) * LANES + k] += work[(change + j) * LANES + k]
-            # the lane has converged if C, from before this change, is a rounding error: the change makes q still better
+            # C is older than this change: if C is a rounding error, the lane has converged, and the change improves q
             if _constraints_hold(work, pattern, n, n_rows, memory, G, new, k):
                 work[at.UNCONVERGED * LANES + k] = 0.0
             else:

@@ -81,7 +81,7 @@ def factor(program, is_independent, values, sizes, min_sine_square):
     """Replace the matrix in `values` by its factors; return the smallest squared sine of angles between rows of G.
 
     The angle is between a row and the span of previous rows. Its squared sine is -pivot / (squared norm of the row);
-    `sizes` receives the squared norms, the diagonal 1/pivot. On entry, `is_independent` is 0 for rows that count as
+    `sizes` receives the squared norms, and the diagonal 1/pivot. On entry, `is_independent` is 0 for rows that count as
     redundant. It is set to 0 for rows with a squared sine of at most `min_sine_square`. Rows with 0 are left out of the
     factors. If the pivot of a coordinate is not positive (M is not positive definite), return NOT_DEFINITE.
     """
