@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 # product of powers as pairs (index of the base in ParameterTape.atoms, exponent); the empty tuple is the number 1
 Powers = tuple[tuple[int, float], ...]
 
-MAX_TERMS = 200  # a callback is not traced if a sum has more terms with parameters: long sums are slow to compare
+MAX_TERMS = 200  # largest number of terms with parameters in a sum of a traced callback: long sums are slow to compare
 _as_float = float.__pos__  # converts a Parameter to a float; float(x) raises an exception while callbacks are traced
 # the sum of two terms counts as zero if its magnitude is at most this fraction of the second term
 CANCELLATION_LIMIT = 8.0 * 2.0**-52

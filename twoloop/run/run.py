@@ -129,7 +129,7 @@ class Run:
         self.jumps: list[float] = []  # times (s) at which velocities jumped because C_t, or b in A v + b = 0, jumped
         self.compared_until = [-np.inf]  # latest time (s) of a comparison with traces; copies of the run share the list
         self.region: CheckedRegion | None = None  # where callbacks agreed with traces; None: the system's region
-        self.varied_parameters: Array | None = None  # parameters in which systems that share this run differ
+        self.varied_parameters: Array | None = None  # parameter values now, if systems share this run; None: one system
         self._compute_start_accelerations()
         self.rank = len(self.work.rows_v)
         self.descriptions: dict[tuple[int, ...], str] = {}  # cached warnings; the keys are indices of redundant rows

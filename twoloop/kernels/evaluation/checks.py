@@ -363,9 +363,9 @@ def _is_close(fused, separate, tolerance, rounding_errors):
 def kinematics_agree(f, t, q, v, fused, separate, roundings, tolerance, rounding):
     """Return True if the callback `kinematics` agrees with the separate callbacks for C, C_t, gamma and C_q.
 
-    Differences of up to `tolerance` times the largest value of each of the four are allowed; for C_i, also `rounding`
-    times the sum of |C_q[i, j] q_j| over j. On return, `fused` (by `kinematics`) and `separate` (by the others) contain
-    C, C_t, gamma and C_q. Both (3 + n_q, n_c) and `roundings` (n_c, scratch) are zero on entry.
+    In each of these, differences may be up to `tolerance` times the largest value; for C_i, `rounding` times the sum of
+    |C_q[i, j] q_j| over j is added. On entry, `fused`, `separate` (3 + n_q, n_c) and `roundings` (n_c, scratch) are 0.
+    On return, `fused` contains C, C_t, gamma and C_q by `kinematics`, and `separate` those by the separate callbacks.
     """
     n, n_c = q.size, roundings.size
     fused_rows, separate_rows = fused[3:].reshape((n_c, n)), separate[3:].reshape((n_c, n))

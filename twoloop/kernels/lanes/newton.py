@@ -555,7 +555,7 @@ def _add_error_in_slow_directions(settings, control, method_options, s, work):
     solve_systems(work, matrix, pivots, n, 0, e_v)
     for k in range(LANES):
         error = work[error_field * LANES + k]
-        # in unstable motion, the filter may enlarge the error: use the smaller error
+        # in unstable motion, the filter may enlarge the error: use the smaller one of the old and the new error
         if work[at.ACTIVE * LANES + k] == 1.0:
             motion_time = _motion_time(control, work, n, memory, k)
             error = min(error, _velocity_error(control, work, n, e_v, motion_time, state, new, k))
