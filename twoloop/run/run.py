@@ -409,7 +409,7 @@ class Run:
         self.control[self.a.MAX_STEP], self.control[self.a.MAX_EVALUATION_GAP] = min(self.max_step, max_size), gap
 
     def choose_first_step(self, t: float, t1: float, state: Array, longest: float = 0.0) -> float:
-        """Return the size (s) of the first step from a state. If `longest` > 0 (max_step), limit all step sizes."""
+        """Return the size (s) of the first step from a state; if `longest` > 0 (max_step), store limits of sizes."""
         numbers = self.system.n_q, t, t1, self.least_atol, longest, self.plan.evaluates_within
         size: float = entry_point(cached_run().first_step_and_limits)(self.control, self.tolerances, state, *numbers)
         return size

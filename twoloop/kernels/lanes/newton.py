@@ -261,7 +261,7 @@ def predict_stages(settings, c, work, begins):
 
 @compiled
 def _compute_residuals(code, settings, control, A, A2, c, work):
-    """Store in RESIDUAL the accelerations at the stages minus STAGES; set SCALE_Q, SCALE_V; on failure, ACTIVE = 0."""
+    """Store RESIDUAL = F - STAGES (F: accelerations by the equations), SCALE_Q, SCALE_V; on failure, ACTIVE = 0."""
     n, order = settings[at.N], settings[at.ORDER]
     _, new, _, _, a, _, _, memory = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])
     s = c.size
