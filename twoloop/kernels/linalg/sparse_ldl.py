@@ -83,7 +83,7 @@ def factor(program, is_independent, values, sizes, min_sine_square):
     The angle is between a row and the span of previous rows. Its squared sine is -pivot / (squared norm of the row);
     `sizes` receives the squared norms, and the diagonal 1/pivot. On entry, `is_independent` is 0 for rows that count as
     redundant. It is set to 0 for rows with a squared sine of at most `min_sine_square`. The factors leave out rows with
-    `is_independent` = 0. If the pivot of a coordinate is not positive (M is not positive definite), return NOT_DEFINITE.
+    `is_independent` = 0. If a pivot of a coordinate is not positive (M is not positive definite), return NOT_DEFINITE.
     """
     (n_q, n) = program[N_COORDINATES], program[N_PIVOTS]
     order, runs = pivot_order_of(program), update_runs_of(program)
