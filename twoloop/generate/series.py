@@ -66,7 +66,7 @@ class SeriesProgram:
     early : operations that depend on t and q only; after them, the products in G v.
     late : operations that depend on v, too; after them, the products in G^T lam + M a.
     rows, row_indices : nonzero rows of G v + (C_t, b), and their indices. Terms "constant times v_i" are left out.
-    balance, balance_indices : nonzero rows of Q - G^T lam - M a, and indices, without "constant times lam_i or a_i".
+    balance, balance_indices : likewise for Q - G^T lam - M a; terms with "constant times" lam_i or a_i are left out.
     traced : traces of the callbacks, for a comparison with calls; None: nothing is compared.
     """
 

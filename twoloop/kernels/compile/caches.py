@@ -108,7 +108,7 @@ def reason_to_distrust(folder: Path) -> str:
             continue
         except OSError as error:
             return f"{each} cannot be examined ({error.strerror})"
-        # all users can create files in a sticky folder (/tmp), but only its owner and a file's owner can replace a file
+        # anybody can create files in a sticky folder (/tmp), but only the folder's or file's owner can replace a file
         is_sticky = each != real_path and status.st_mode & stat.S_ISVTX
         reason = _reason_of_owner(status) if is_sticky else _reason_of_mode(status)
         if reason:

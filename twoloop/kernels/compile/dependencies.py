@@ -345,7 +345,7 @@ class FunctionCopier:
         self.copies: dict[Any, Any] = {}  # replacements, by id of the original
 
     def replacement_of(self, value: Any, names: frozenset[str] = frozenset()) -> Any:
-        """Return `value` with helpers replaced: itself, the items of a tuple, or the attributes `names` of a module."""
+        """Return `value` after replacing helpers: itself, items of a tuple, or the attributes `names` of a module."""
         if self.is_copied(value):
             if id(value) not in self.copies:
                 self._add_copy(value)
@@ -357,7 +357,7 @@ class FunctionCopier:
         return value
 
     def is_copied(self, value: Any) -> bool:
-        """Return True if `replacement_of` copies `value`, a compiled helper (or what a derived class chooses)."""
+        """Return True for compiled helpers, which `replacement_of` then copies; derived classes may choose others."""
         return isinstance(value, Dispatcher) or bool(jitable_templates(value))
 
     def _copy_module(self, module: types.ModuleType, names: frozenset[str]) -> types.ModuleType:
@@ -382,7 +382,7 @@ class FunctionCopier:
         own_globals = dict(function.__globals__)
         copy = types.FunctionType(function.__code__, own_globals, function.__name__, function.__defaults__, cells)
         copy.__kwdefaults__, copy.__qualname__ = function.__kwdefaults__, function.__qualname__
-        self.copies[id(helper)] = self.wrap(copy, helper)  # first, as lines below read it if the helper calls itself
+        self.copies[id(helper)] = self.wrap(copy, helper)  # stored first, as a helper that calls itself needs it
         for name in used_names & set(own_globals):
             own_globals[name] = self.replacement_of(own_globals[name], names)
         if function.__defaults__ is not None:

@@ -180,7 +180,7 @@ MAX_LASTING_CHANGE = 0.5
 CHANGE_MARGIN = 0.01
 # w.changes has a column for each force, C_t and b; rows 0 to N_SAMPLES contain samples at successive times
 LARGEST_ROW = N_SAMPLES + 1  # row of w.changes: largest |value| of each force, C_t and b so far
-MIDDLE_ROW = N_SAMPLES + 2  # row of w.changes: one more sample, at a time between or before those of the rows above
+MIDDLE_ROW = N_SAMPLES + 2  # row of w.changes: one more sample, at a time between or before the other samples
 N_CHANGES = N_SAMPLES + 3  # number of rows of w.changes
 
 
@@ -241,7 +241,7 @@ def _first_sudden_bend(values, n, detrends, min_range):
     subtracts the straight line from the first to the last searched sample if `detrends` is 1, nothing if it is 0.
     """
     index, limit = _find_sudden_bend(values, n, detrends * (values[n] - values[0]) / max(n, 1), min_range, False)
-    while index > 1:  # from now on, skip smooth bends (True): a few samples of a smooth curve may bend like a jump
+    while index > 1:  # skip smooth bends here (True), because a few samples of a smooth curve may bend like a jump
         slope = detrends * (values[index] - values[0]) / index
         earlier, bound = _find_sudden_bend(values, index, slope, min_range, True)
         if earlier == 0:
@@ -390,9 +390,9 @@ def _acceleration_lasts(f, w, tolerances, t, duration, q, v, a, Q, V, A):
 
 @compiled
 def _sample_motion(f, w, tolerances, control, clock, spacing, t, size, last, q, v, a, Q, V, A):
-    """Sample along the motion if earlier samples end within the step; store the next sudden change in `clock`.
+    """Sample forces, C_t and b along the motion if earlier samples end within the step; find the next sudden change.
 
-    Samples extend from t over the step size or MIN_TIME_AHEAD * `spacing`, whichever is longer, but not beyond `last`.
+    Store this change in `clock`. Samples extend over max(`size`, MIN_TIME_AHEAD * `spacing`), but not beyond `last`.
     """
     if clock[at.MOTION_SAMPLED_TO] >= t + (1.0 - CHANGE_MARGIN) * size:
         return
@@ -407,7 +407,7 @@ def _sample_motion(f, w, tolerances, control, clock, spacing, t, size, last, q, 
             f, w, tolerances, clock, t, t, duration / N_SAMPLES, last, 1.0, q, v, A
         )
     clock[at.SAMPLES_MOTION] = 0.0
-    # unless samples at a fixed state end at a change, samples along the motion replace them if as close in time
+    # if samples at a fixed state show no change, samples along the motion replace them, provided these are as dense
     change_found = clock[at.SAMPLED_TO] == clock[at.DISCONTINUITY] > t
     if not change_found and duration <= N_SAMPLES * min(control[at.TIME_SPACING], size / MIN_SAMPLES_IN_STEP):
         clock[at.WIDEST_SAMPLING] = max(clock[at.WIDEST_SAMPLING], duration / N_SAMPLES)

@@ -121,7 +121,7 @@ H_LONG_DECAY = 0.98  # factor by which each accepted step reduces clock[H_LONG],
 
 @merged
 def count_step(w, tolerances, control, clock, size, out_step):
-    """Record an accepted step of `size` (s) in its row `out_step`, the statistics in `w`, and the clock's H_LONG."""
+    """Record an accepted step of `size` (s) in `out_step`, statistics in `w`, and the longest recent size, H_LONG."""
     w.n_accepted += 1
     if w.defect >= 0.0:
         w.largest_defect = max(w.largest_defect, w.defect)
@@ -161,8 +161,8 @@ def prediction_error(w, tolerances, h, q, v, q1):
     """Return the largest |w.predicted - q1| (dependent positions) / (allowed error), for a step from (q, v) to q1.
 
     The formula predicted w.predicted; q1 satisfies the constraints. The allowed error is the tolerance or, if smaller,
-    about FRACTION_OF_MOTION (if det C_qd changes sign: FRACTION_AT_SIGN_CHANGE) times the largest displacement. Store
-    the sign of det C_qd at q1, where `w` must contain the factors of C_qd. If steps have a fixed size, only return 0.
+    about FRACTION_OF_MOTION (if det C_qd changes sign: FRACTION_AT_SIGN_CHANGE) times the largest displacement.
+    w.orientation_new becomes the sign of det C_qd, from its factors in `w`. If steps have a fixed size, only return 0.
     """
     if tolerances[ESTIMATE] == 0.0:
         return 0.0

@@ -68,14 +68,14 @@ FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN, REACTION_BY_Q_GIVEN, MASS_VALUES_GIVEN = (
     GAMMA_ACCURACY,  # error of Gamma, relative to GAMMA_SCALE, when GAMMA_STEP_RATIO was chosen last
     GAMMA_SCALE,  # size to which errors of Gamma are compared: largest |entry| of Gamma, or sum of |G_ij a_j|, so far
     REUSE,  # the inner loop keeps C_q and its factors after a correction of positions of at most this size
-    ROUNDED,  # rounding error of positions; the limit in place of REUSE where the inner loop computes the end of a step
+    ROUNDED,  # rounding error of positions; at ends of steps, C_q is kept only after a correction of at most this size
     GENERATION,  # number of partitions so far: a change of this number shows that the partition has changed
     RANK,  # rank of C_q, stored only if the workspace was allocated for another rank (code RANK_DIFFERS)
     RANK_V,  # rank of [C_q; A], stored together with RANK
     CONTRADICTION,  # with the code ROWS_CONTRADICT: index of a violated row of [C_q; A]
     # smallest pivot in the last elimination of C_q, with rows scaled to maxima of 1; fixed-order form: sqrt(SMALLEST)
     PIVOT,
-    # 1: a singular position was near, or the method does not look for one; 2: one is near: project stages; 0: neither
+    # 1: a singular position was near, or the method never checks for one; 2: one is near, stages are projected; 0: else
     NEARLY_SINGULAR,
     NEAR_NOW,  # 1: a singular position was near at the last check; 2: the next check chooses a new partition; 0: else
     MASS_SCALE,  # factor by which M is multiplied in the augmented matrix, see linalg/saddle_point.py
@@ -89,8 +89,8 @@ FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN, REACTION_BY_Q_GIVEN, MASS_VALUES_GIVEN = (
     WIDEST_GAP,  # longest time (s) between two evaluations of the equations within accepted steps
     LAST_JUMP,  # time (s) of the last known jump of a constraint rate (C_t, b); -infinite: none
     NEXT_JUMP,  # time (s) of the next known jump of a constraint rate (C_t, b), or end of the run; infinite: unknown
-    # redundant rows are sums of coefficient * independent row: largest |coefficient| at this partition's first check
-    MAX_COEFFICIENT,  # at least 1; 0: not checked yet
+    # largest |coefficient| of redundant rows as sums of independent rows, at this partition's first check; 0: unknown
+    MAX_COEFFICIENT,
     SMALLEST,  # fixed-order form: smallest sine^2 of an angle between rows of C_q; negative: M is not positive definite
     TIME_IS_UP,  # 1 (set by another thread): the time limit has passed, and evaluations return STOPPED; 0: not yet
     N_NOTES,

@@ -222,7 +222,7 @@ def stages_at_once(options):
 
 @compiled
 def _update_derivatives(f, w, options, tolerances, memory, t, h, Q, V, F):
-    """If outdated, compute derivatives at (t, Q, V), with accelerations F, and Newton's factors; return a code."""
+    """If they are outdated, compute derivatives at (t, Q, V; accelerations F) and Newton's factors; return a code."""
     if f.force_by_q_given == 1 or memory[at.HAS_JACOBIAN] == 0.0:
         multipliers(f, w, t, Q, V, F, w.lam)
         memory[at.HAS_JACOBIAN] = 1.0
@@ -340,7 +340,7 @@ def _factor_filter(f, w, options, memory, h):
 
 @compiled
 def _store_weighted_sums(w, h, V_stage, A_stage, weights, factor, e_q, e_v):
-    """Estimate errors of independent q and v: h factor sum_k weights[k] V_stage[k] in e_q, with A_stage[k] in e_v."""
+    """Estimate errors of independent q and v: e_q, e_v = h factor sum_k weights[k] (V_stage[k], A_stage[k])."""
     for i in range(w.independent.size):
         j = w.independent[i]
         sum_q, sum_v = 0.0, 0.0
@@ -433,7 +433,7 @@ def _apply_embedded_formula(f, w, options, memory, h, q1, v1):
 def _error_in_slow_directions(f, w, options, memory, h, tolerances, state, new_state, A_stage):
     """Return the effect, in tolerances, of the slowly decaying part of the estimated velocity error E_V in `memory`.
 
-    If all of E_V has an effect of at most 1, return 0. E_Q, E_V and Newton's factors change. See newton_step.py.
+    If all of E_V has an effect of at most 1, return 0. E_Q, E_V and Newton's factors are overwritten.
     """
     n = w.Q.size
     e_q, e_v = vector(memory, 1, n, at.E_Q), vector(memory, 1, n, at.E_V)

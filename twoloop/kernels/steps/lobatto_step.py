@@ -59,7 +59,7 @@ START_CONTRACTION = 0.12  # the first step size is guessed so that a sweep multi
 MAX_GUESSES = 4  # largest number of guesses of the first step size
 FACTOR_AFTER_DIVERGENCE = 0.6  # ratio of the next step size to the size of a step whose iteration did not converge
 SAFETY = 0.75  # safety factor on the step size for which the estimated error would equal the tolerance
-# another method takes over if a counter reaches this; steps limited by convergence add 1, others subtract 1 down to 0
+# counter at which another method takes over; steps limited by convergence add 1, other steps subtract 1 down to 0
 MAX_LIMITED = 24.0
 # accelerations hardly vary in a step if the Legendre coefficients of degrees 5 and 6 are below this many tolerances
 MIN_CURVATURE = 0.1
@@ -68,7 +68,7 @@ MIN_PIVOT_RATIO = 0.4  # another method takes over if a step multiplies the smal
 # if the smallest tolerance is below this, another method takes over once a singular position was near. Without this
 # rule, five more runs of the benchmark A02 (N-four-bar mechanism) end with wrong results
 TIGHT_TOLERANCE = 1e-8
-MAX_FAILURES = 12.0  # another method takes over if a counter reaches this; diverged steps add 2, accepted steps take 1
+MAX_FAILURES = 12.0  # counter at which another method takes over; diverged steps add 2, accepted steps subtract 1
 CHECKED_GAP = 0.0908  # (longest time between evaluations) / (step size), if the defect is evaluated between nodes, too
 # largest ratio of successive step sizes: GROWTH_EARLY in the first N_EARLY steps of a run, GROWTH in later steps
 N_EARLY, GROWTH_EARLY, GROWTH = 6, 4.0, 1.3
@@ -105,7 +105,7 @@ def _reuse_rejected_polynomial(f, data, state):
 
 @compiled
 def _solve_collocation(f, w, options, data, tolerances, t, h, state):
-    """Solve for the stages of a step of size h; return a code, an error estimate, and the next step size / h.
+    """Solve for the stages of a step of size h; return a code, an error estimate, and the factor (next step size) / h.
 
     The stages are stored in `data`, the memory of the method. The estimate is relative to the tolerances. Codes:
     CONVERGED; REJECTED if the estimate or the defect is too large, or the iteration diverges; GUESSED if h, a guess of
@@ -153,7 +153,7 @@ def _solve_collocation(f, w, options, data, tolerances, t, h, state):
         max_factor = min(max_factor, factor_by_defect)
     max_factor = min(max_factor, h_max / h)
     extra_sweeps = data[field.SWEEPS] - data[field.N_TARGET]
-    # the motion may be stiff if accelerations hardly vary, but the step took N_TARGET - 1 or more sweeps
+    # the motion may be stiff if accelerations hardly vary, but sweeps are at most one fewer than intended (N_TARGET)
     is_limited = data[field.CURVATURE] < MIN_CURVATURE and extra_sweeps >= -1.0
     data[field.LIMITED] = max(0.0, data[field.LIMITED] + (1.0 if is_limited else -1.0))
     # `trend`: ratio of the step sizes that the errors of this and of the last step allow. A trend below 1 probably
@@ -197,7 +197,7 @@ def _must_change_method(w, data, tolerances):
 
 @compiled
 def _passes_singular_position(f, w, t, h, state, new_state):
-    """Return True if the smallest pivot of C_q falls within a step to less than MIN_PIVOT_RATIO times its first value.
+    """Return True if, in a step, the smallest pivot of C_q falls below MIN_PIVOT_RATIO times its value at the start.
 
     Another method then has to cross the singular position: near it, stages that violate the constraints have wrong
     accelerations. Positions within the step follow from the cubic through positions and velocities at both ends.
@@ -313,7 +313,7 @@ def _adopt_projection(f, w, options, data, tolerances, driven, n, k, t, row, sta
 
 @merged
 def _can_take_next_step(w, data, tolerances, control, clock, h):
-    """Return False if the integrator must act before the next step: its size h is small, or the method must change."""
+    """Return False if the integrator must act before the next step: its size h is too small, or the method unsuited."""
     h_long = clock[at.H_LONG]
     if h <= control[at.SHORTEST] or h < COLLAPSED_STEP * h_long or _must_change_method(w, data, tolerances):
         return False
