@@ -164,7 +164,7 @@ class Graph(SymbolicObject):
         return order
 
     def product(self, a: "Affine", b: "Affine") -> "Affine":
-        """Return a * b: a number times a recorded product, which products that differ by a constant factor share."""
+        """Return a * b as a number times a recorded product; products that differ by a constant factor share one."""
         if not a.terms:
             return b.times(a.constant)
         if not b.terms:

@@ -108,7 +108,7 @@ class SampledRun:
             np.empty((MAX_ATTEMPTS, self.run.a.N_STEP_COLUMNS)),
         )
         self.rows, self.times, self.steps = list[Array](), list[float](), list[Array]()
-        self.cpu_time, self._max_gap = 0.0, np.inf  # CPU time (s); largest time (s) between force evaluations
+        self.cpu_time, self._max_gap = 0.0, np.inf  # CPU time (s); longest allowed time (s) between samples of forces
         self._store_sample(t0)
 
     def _create_run(self, t: float, q: Array, v: Array) -> Run:

@@ -372,7 +372,7 @@ def sources_folder() -> Path:
 
 @cache
 def warn_once(text: str) -> None:
-    """Print a text on stderr, once in a process."""
+    """Print a text on stderr, unless this process has already printed it."""
     print(text, file=sys.stderr, flush=True)
 
 

@@ -35,7 +35,7 @@ DIGEST_VERSION = 2  # part of all digests: increase it to make all machine code 
 
 
 def digest_of(text: str, *sources: str | types.ModuleType) -> str:
-    """Return one hash of a text and of source files (paths or modules); if it changes, cached files are outdated."""
+    """Return one hash of a text and source files (paths or modules); if the hash changes, cached files are outdated."""
     digest = hashlib.sha256(text.encode())
     for source in sources:
         digest.update(Path(source if isinstance(source, str) else str(source.__file__)).read_bytes())
@@ -357,7 +357,7 @@ class FunctionCopier:
         return value
 
     def is_copied(self, value: Any) -> bool:
-        """Return True for compiled helpers, which `replacement_of` then copies; derived classes may choose others."""
+        """Return True for compiled helpers, which `replacement_of` then copies; derived classes may add values."""
         return isinstance(value, Dispatcher) or bool(jitable_templates(value))
 
     def _copy_module(self, module: types.ModuleType, names: frozenset[str]) -> types.ModuleType:

@@ -28,10 +28,10 @@ from twoloop.kernels.compile.callbacks import OPTIONAL_KINDS
 (
     CONSTANT_MASS,  # 1: the mass matrix M is constant; 0: it varies
     DIAGONAL_MASS,  # 1: the mass matrix M is diagonal; 0: it may have other entries
-    BANDWIDTH,  # bandwidth of the mass matrix if it is factored as a banded matrix; -1: it is not
+    BANDWIDTH,  # bandwidth of the mass matrix if it is factored as a banded matrix; -1: no banded factors
     FORM,  # algebra that solves for accelerations and multipliers: MULTIPLIERS, NULL_SPACE, AUGMENTED or FIXED_ORDER
     DENSE_FORM,  # value that FORM gets instead of AUGMENTED if the sparse factors exceed the limits in markowitz_lu.py
-    IS_GENERATED,  # 1: the inner loop is code generated for the mechanism; 0: it is the one for any mechanism
+    IS_GENERATED,  # 1: the inner loop is code generated for the mechanism; 0: it is general code for any mechanism
     FIRST_GIVEN,  # index of the first flag of an optional callback, see GIVEN
 ) = range(7)
 MULTIPLIERS, NULL_SPACE, AUGMENTED, FIXED_ORDER = range(4)  # values of FORM, see saddle_point.py, sparse_inner_loop.py

@@ -106,7 +106,7 @@ def factor_newton_matrix(w, memory, z):
         if ldl_factor(H):
             memory[at.IS_SYMMETRIC] = 1.0
             return DONE
-        # L D L^T fails if the matrix is indefinite (for example, with a compressed beam): fill it again, and use L U
+        # L D L^T fails if the matrix is indefinite, for example with a compressed beam: fill the matrix again, use L U
         _fill_newton_matrix(w, memory, n, m, z, storage)
     return DONE if lu_factor(H, pivots_of(memory, 1, n, 0)) > 0.0 else SINGULAR
 
@@ -115,7 +115,7 @@ def factor_newton_matrix(w, memory, z):
 def compute_and_factor_matrix(f, w, tolerances, memory, t, q, v, z):
     """Compute the derivatives of forces at (t, q, v), and factor Newton's matrix with them; return a code.
 
-    The last evaluation must have been at (t, q, v), w.lam must be the multipliers there. z: step size times gamma.
+    The last evaluation must have been at (t, q, v), and w.lam must be its multipliers. z: step size times gamma.
     """
     n = q.size
     m = w.independent.size
