@@ -76,7 +76,7 @@ def tableau_of(options):
 
 @inlined
 def _vector_view(memory, n, index):
-    """Return a view (2 n, padded) of the vector number `index`, such as STAGE_STATE, in `memory`."""
+    """Return a view (2 n, padded) of the vector with this `index`, such as STAGE_STATE, in `memory`."""
     return memory[index * _padded_width(n) : (index + 1) * _padded_width(n)]
 
 
@@ -147,7 +147,7 @@ def explicit_step(f, w, options, memory, t, h, tolerances, state, new_state):
     w.n_outer += 1
     copy(state[n : 3 * n], slopes[0])
     for j in range(1, s):
-        _add_weighted_slopes(y, h, A[j, :j], slopes, stage, stage)  # for dependent coordinates, only first guesses
+        _add_weighted_slopes(y, h, A[j, :j], slopes, stage, stage)  # dependent coordinates in `stage` are first guesses
         v_stage, a_stage = slopes[j, :n], slopes[j, n : 2 * n]
         copy(stage[n : 2 * n], v_stage)
         if is_free:
