@@ -241,7 +241,7 @@ class SplitFunctions:
         return all_valid
 
     def _lowering(self, emit: Emitter, graph: Graph, args: Sequence[Value], stored: Mapping[int, Location]) -> Lowering:
-        """Return an object that writes operations; `args` begin with three inputs and a pointer to coefficients."""
+        """Return a Lowering, which writes operations; `args` begin with three inputs and a pointer to coefficients."""
         *inputs, emit.numbers = args[:4]
         if width_of(emit.double_type) > 1:
             emit.constants = emit.numbers  # type: ignore[attr-defined]  # the coefficients are the same in all lanes
@@ -491,7 +491,7 @@ def _relative_error(code: GeneratedCode, system: ConstrainedSystem, t0: float, q
     """Return the relative error of accelerations by generated code, for velocities 0, at or near the start (t0, q0).
 
     At most MAX_POSITIONS positions are tried until pivots are large enough; if no position has such pivots, return
-    infinity. Two generated functions compute accelerations, one after a projection: return the larger error.
+    infinity. Two generated functions compute accelerations, one of them after a projection: return the larger error.
     """
     rows, n = list(code.shared.equations.choice.rows), system.n_q
     v, a, reduced, lam = np.zeros(n), np.empty(n), np.empty(n), np.empty(system.n_c + system.n_a)

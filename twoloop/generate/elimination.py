@@ -369,7 +369,7 @@ class Elimination:
         return matrix
 
     def _solve(self, r: Sequence[Affine], c: Sequence[Affine]) -> tuple[list[Affine], list[tuple[Affine, Affine]]]:
-        """Solve M a + G^T lam = r, G a = c (c: for all rows); return [a, lam], and conditions for their validity."""
+        """Solve M a + G^T lam = r, G a = c (c: all rows); return [a, lam] and conditions of validity (see Program)."""
         return solve_refined(self.factors.solve, self.choice, self.mass, self.all_rows, r, c)
 
     def _right_sides(self, v: Sequence[Affine]) -> tuple[list[Affine], list[Affine]]:
@@ -388,7 +388,7 @@ class Elimination:
 
     @cached_property
     def reduced_program(self) -> Program | None:
-        """Return a program that eliminates dependent coordinates; None if hardly cheaper than `mass_first_program`."""
+        """Return a program that eliminates dependent coordinates; None if `mass_first_program` costs little more."""
         blocks = self.choice.blocks
         if not blocks:
             return None
@@ -420,7 +420,7 @@ class Elimination:
         return Program(self.graph, {"r": force, "c": [x if k in used else self.zero for k, x in enumerate(gamma)]})
 
     def _accelerations(self, v: Sequence[Affine]) -> tuple[list[Affine], list[tuple[Affine, Affine]]]:
-        """Return [a, lam] at velocities v (lam: only of independent rows), and conditions for their validity."""
+        """Return [a, lam] at velocities v (lam: only of independent rows), and conditions of validity (see Program)."""
         return self._solve(*self._right_sides(v))
 
     def _expand_to_all_rows(self, independent: Sequence[Affine]) -> list[Affine]:

@@ -292,7 +292,7 @@ def advance(
         )
         if code == NOT_LOADED:
             return at.NEEDS_COMPILATION
-        if w.time_is_up == 1.0:  # the time limit has passed, perhaps within this attempt: discard it
+        if w.time_is_up == 1.0:  # the time limit has passed, perhaps within this attempt: discard the attempt
             f.commit(f, w, options, memory, tolerances, False)
             return at.PAUSED
         # near a jump of a force, the error estimate may be too small: multiply it by JUMP_RATIO up to the time JUMP_END

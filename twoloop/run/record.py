@@ -307,7 +307,7 @@ class Recorder:
         return DenseSolution(self.interpolator, table, end if self.end_event is None else self.end_event[1])
 
     def events(self) -> tuple[list[Array], list[Array], list[Array]] | tuple[None, None, None]:
-        """Return lists of times, coordinates, velocities: one array per event function; all None if there is none."""
+        """Return times, coordinates, velocities: lists of one array per event function, all None without functions."""
         if self.search is None:
             return None, None, None
         n = self._n_q

@@ -39,7 +39,7 @@ SAFE_CALLS = ("len", "min", "max", "abs", "range", "enumerate", "zip", "reversed
 
 
 def add_bounds_checks(function: Callable[..., Any]) -> tuple[Callable[..., Any], dict[str, Any]]:
-    """Return the function to compile for a callback, and options of numba, so that its indices are checked.
+    """Return the function to compile for a callback, and the options of numba with which machine code checks indices.
 
     The options are empty if no index is computed. If a compiled function that the callback calls (a helper) computes
     indices, the returned function is a copy of the callback that calls copies of all helpers with checks.

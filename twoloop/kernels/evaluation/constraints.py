@@ -171,7 +171,7 @@ def _fill_gamma(f, w, t, q, v, e, first, last):
 
 @merged
 def _max_disagreement(w):
-    """Return the largest allowed difference between Gamma with e and with 2 e; the error of Gamma is less than that."""
+    """Return the allowed difference of Gamma with the time steps e and 2 e; the error of Gamma is less than this."""
     return max(w.gamma_required, ROUNDING_DISAGREEMENT) * w.gamma_scale
 
 
@@ -179,9 +179,9 @@ def _max_disagreement(w):
 def _choose_difference_step(f, w, t, q, v, largest_step, first, last):
     """Store Gamma[first:last] in w.Gamma, by differences with the best of several time steps e.
 
-    Beginning with `largest_step`, divide e by 4 until Gamma changes little. The best e is the one with the least change
-    of Gamma. Store its ratio to `largest_step` in w.gamma_step_ratio. Return GAMMA_INACCURATE if even the least change
-    exceeds the allowed error, else DONE.
+    Beginning with `largest_step`, divide e by 4 until the change of Gamma is small (CONVERGED_CHANGE). The best e is
+    the one with the least change. Store its ratio to `largest_step` in w.gamma_step_ratio. Return GAMMA_INACCURATE if
+    even the least change exceeds the allowed error, else DONE.
     """
     least_change = np.inf
     step_ratio = 1.0

@@ -247,7 +247,7 @@ ROUNDING_OF_Q = 2e-14  # a change of q by at most this fraction of max|q| counts
 def _verify_pattern(w):
     """If the constraint Jacobian w.G has nonzero entries where w.pattern is 0, write new programs of elimination.
 
-    Return DONE if w.G has no such entry, INNER_DIVERGED after new programs, to repeat the step, or SINGULAR on failure.
+    Return DONE if w.G has no such entry, INNER_DIVERGED (repeat the step) after new programs, or SINGULAR on failure.
     """
     if not record_entries(w):
         return DONE
@@ -365,7 +365,7 @@ def prepare_mass(f, w, t, q):
 
 @merged
 def renew_partition(f, w, t, q):
-    """Choose a partition at a consistent q; store sign(det C_qd), of the dependent columns of C_q, in w; return a code."""
+    """At a consistent q, choose a partition, and store sign(det C_qd) (C_qd: dependent columns) in w; return a code."""
     return f.inner(f, w, tasks.RENEW_PARTITION, t, q, q, 0.0, w.x, w.lam)
 
 

@@ -109,7 +109,7 @@ def gamma_by_program(f, w, t, q, v):
 
 @compiled
 def jacobian_by_program(f, w, t, q, G):
-    """Store C_q in G (zero on entry) by a traced program; return False without a program, or for non-finite values."""
+    """Store C_q in G (zero on entry) by a traced program; return False if there is none, or a value is not finite."""
     program = f.jacobian_program
     if program.size == 0:
         return False

@@ -534,8 +534,8 @@ def _filter_error_banded(f, w, options, memory, s, h, e_q, e_v):
 
 # --- sparse storage, for all coordinates
 
-# the sparsity pattern of a derivative of the residual (K by q, D by v) lacks entries if derivative * displacement
-# differs from the change of the residual by more than this fraction of the sum of |terms| of the product
+# K lacks entries if a displacement d of q changes a component i of the residual by a number that differs from
+# sum_j K_ij d_j by more than this fraction of sum_j |K_ij d_j|. D, the derivative by v, is tested like K
 MAX_DEVIATION = 0.2
 RESIDUAL_ROUNDING = 1e-13  # rounding error of a difference of residuals, relative to the largest term of a residual
 N_SPARSE_VECTORS = 3  # number of real scratch vectors, which _sparse_scratch returns first
@@ -655,7 +655,7 @@ def _has_complete_pattern(f, base, residual, base_point, moved, largest, entries
     """Return True if K or D, given by its `entries`, predicts how the residual changes with a displacement.
 
     If not, its pattern lacks entries. `base`, `residual`: residuals at `base_point` (q or v) and at the displaced point
-    `moved`. `largest`: largest term of a residual, see RESIDUAL_ROUNDING. `residual` and `predicted` (n_q) change.
+    `moved`. `largest`: largest term of a residual, see RESIDUAL_ROUNDING. `residual` and `predicted` are overwritten.
     """
     rows, columns, _ = tangent_entries_of(f.newton_program)
     predicted[:] = 0.0
@@ -731,7 +731,7 @@ def _factor_sparse_matrix(f, w, z, factors):
 
 @compiled
 def _fill_sparse_right_side(f, w, r, right):
-    """Store in `right` the right-hand side [M r; G r] (r: residual) with terms of `add_terms_of_redundant_rows`."""
+    """Store in `right` [M r; G r] (r: residual), plus terms of redundant rows g with s g^T g in M."""
     mass, jacobian, _, _, is_independent, stiffness = _sparse_derivative_views(f, w)
     right[:] = 0.0
     rows, columns, _ = mass_entries_of(f.newton_program)
@@ -765,7 +765,7 @@ def _filter_error_sparse(f, w, options, s, h, e_q, e_v):
 def fill_derivatives(f, w, options, tolerances, memory, s, t, q, v, a):
     """Store the derivatives for Newton's matrix at the last evaluated state (t, q, v); return DONE or an error code.
 
-    In dense storage, these are derivatives of accelerations, else of forces. `a`: accelerations at this state.
+    In dense storage, these are derivatives of accelerations, otherwise of forces. `a`: accelerations at this state.
     """
     if f.form == FIXED_ORDER:
         return _fill_sparse_tangents(f, w, tolerances, memory, t, q, v)
