@@ -271,7 +271,7 @@ class LaneSteps:
             )
 
     def tolerances(self, emit: LaneEmitter, control: Value) -> tuple[Value, list[Value]]:
-        """Return rtol, and the list of the atol of the coordinates, broadcast to all lanes."""
+        """Return rtol and a list of atol, one for each coordinate, all broadcast to the lanes."""
         atol = [broadcast_entry(emit, control, lanes.ATOL + j) for j in range(self.n)]
         return broadcast_entry(emit, control, lanes.RTOL), atol
 
@@ -445,7 +445,7 @@ class _Coordinate:
         return 1.0 / (atol + rtol * magnitude)
 
     def store_state(self, weights: Array, position_weights: Array, x: Value) -> tuple[Value, Value]:
-        """Write code that stores q and v in NEW: weighted sums of accelerations (`weights` for v); return (q, v)."""
+        """Write code that stores q and v of a stage, computed with weighted accelerations, in NEW; return q and v."""
         emit, (q, v) = self.emit, self.old_state
         drift = float(weights.sum()) * v
         q = q + x * (drift + x * self.sum(position_weights))
@@ -579,7 +579,7 @@ class LaneCode(LaneSteps):
         emit.store(builder.select(is_last, t1, t + h), work, lanes.T_NEW)
 
     def correct_positions(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Write code for a Newton step to C = 0 where ACTIVE = 1; ACTIVE and UNCONVERGED become 1 if valid, else 0."""
+        """Write code for a Newton step to C = 0 if ACTIVE = 1; ACTIVE, UNCONVERGED become 1 if it is valid, else 0."""
         is_active, _ = self._project(
             emit, self.equations.position_projection, lanes.ACTIVE, self.memory(emit, order, control, work)
         )
@@ -642,7 +642,7 @@ class LaneCode(LaneSteps):
         return is_valid, a
 
     def crossing_mask(self, emit: LaneEmitter, memory: LaneMemory) -> Value | None:
-        """Return `orientation_change_mask(...)`, or None for Taylor steps, whose defects show singular positions."""
+        """Return `orientation_change_mask(...)`; None without constraints, or if defects are checked (Taylor steps)."""
         if self.recurrences is not None or len(self.equations.rows) == 0:
             return None
         ends_of_step = (lanes.T, memory.state), (lanes.T_NEW, memory.new)

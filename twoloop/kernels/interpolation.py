@@ -1,7 +1,7 @@
 """Interpolate states within steps by polynomials through neighbouring states, and project the results.
 
 Row i of `states` is [q, v, a] at the time t[i]; interval i is between rows i and i + 1. If a method takes long steps,
-`fill_intervals` first computes states within an interval, for its polynomial to interpolate. `f`: kit, `w`: workspace.
+`fill_intervals` first computes states within an interval, which its polynomial interpolates. `f`: kit, `w`: workspace.
 """
 
 import numpy as np
@@ -19,14 +19,14 @@ CHECKED_FRACTIONS = (0.3, 0.7)  # times at which polynomials are checked, as fra
 N_CHECKED_TIMES = len(CHECKED_FRACTIONS)
 EPS = 2.0**-52  # spacing of floating-point numbers at 1
 MAX_GAP_RATIO = 8.0  # neighbouring steps count as equally long if the longest is at most this multiple of the shortest
-# v has polynomials of its own if (rounding error of q) / (duration of interval) exceeds this number of its tolerances
+# v has polynomials of its own if (rounding error of q) / (interval's duration) exceeds this number of v's tolerances
 MAX_VELOCITY_ROUNDING = 10.0
-# pivot ratio: smallest / largest pivot of the constraint Jacobian at a position, see min_pivot_ratio in partition.py
-SINGULAR_PIVOT_RATIO = 0.01  # a position is singular if its pivot ratio is below this * that at an end of the interval
-SINGULAR_PIVOT = 1e-5  # a position is singular if its pivot ratio is below this
-# a position is also singular if its pivot ratio (smallest / largest pivot) is below WEAK_PIVOT, and the violation of
-# constraints that projection of v has removed may be due to rounding, as it is below MAX_VIOLATION tolerances. This
-# violation is about (pivot ratio) * (change of v by the projection)
+# pivot ratio: smallest / largest pivot of the constraint Jacobian (partition.py). A position is singular if its ratio
+# is below SINGULAR_PIVOT, or below SINGULAR_PIVOT_RATIO times the larger ratio at the ends of its interval
+SINGULAR_PIVOT_RATIO = 0.01
+SINGULAR_PIVOT = 1e-5
+# a position is also singular if its pivot ratio r is below WEAK_PIVOT, and r * (change of v by projection, in units of
+# the tolerances) below MAX_VIOLATION: this product is about the removed violation, which may then be due to rounding
 MAX_VIOLATION, WEAK_PIVOT = 10.0, 0.05
 
 
@@ -220,7 +220,7 @@ def _state_difference(tolerances, scale_q, scale_v, states, i, q, v, q_other, v_
         change_q = scale_q * abs(q_other[m] - q[m]) / (atol + rtol * abs(states[i, m]))
         change_v = scale_v * abs(v_other[m] - v[m]) / (atol + rtol * abs(states[i, n + m]))
         largest, total = max(largest, change_q, change_v), total + change_q + change_v
-    # `total` is not finite if times of interpolated states coincide, as after steps no longer than rounding of times
+    # `total` is not finite if two interpolated states have equal times, as after a step no longer than rounding of t
     return largest if np.isfinite(total) else np.inf
 
 

@@ -129,7 +129,7 @@ def cached_run() -> Any:
 
 
 def _fixed_order_shapes(n_q: int, n_c: int, rank: int, form: FixedOrderSizes) -> tuple[dict[str, tuple[int, ...]], ...]:
-    """Return {name: shape} of the float arrays, and of the integer arrays, that the fixed-order form uses differently.
+    """Return {name: shape} of float arrays, and of integer arrays, that have special shapes in the fixed-order form.
 
     The fixed-order form has no partition. All coordinates are listed as independent. They are also listed as dependent,
     because steps compare predicted and projected positions of the dependent coordinates.

@@ -23,7 +23,7 @@ from twoloop.run.workspace import kit_for_plan, make_kit
 
 # let r be (duration of the shortest change of forces or drives seen in a run) / (longest time between evaluations). If
 # r < REPEAT_BELOW, the run may have missed shorter changes, and is repeated. If r < WARN_BELOW, the run may even have
-# missed changes of this duration: it warns if it is not repeated any more
+# missed changes of this duration: it warns, unless it is repeated
 REPEAT_BELOW, WARN_BELOW = 2.0, 1.25
 EVALUATIONS_PER_CHANGE = 4.0  # number of evaluations that a repetition makes within the shortest change seen so far
 MAX_REFINEMENT = 8.0  # largest factor by which a repetition reduces the longest time between evaluations
@@ -43,7 +43,7 @@ def gap_for_repetition(run: Run) -> float:
 
 
 def warn_of_missed_changes(run: Run) -> str:
-    """Warn if a run may have missed short changes of forces, and is not repeated; return the warning, or ""."""
+    """Warn if a run that is not repeated may have missed short changes of forces; return the warning, else ""."""
     if not may_have_missed_changes(run, WARN_BELOW):
         return ""
     a, clock = run.a, run.clock
@@ -140,7 +140,7 @@ NODE_DISTANCES = 1.0, 0.5, 0.25  # values that are tried in turn for the field `
 
 
 class Limits(NamedTuple):
-    """Limits of a polynomial across a singular position, and of its steps; if none succeeds, wider limits are tried."""
+    """Limits of a polynomial across a singular position and of its steps; if no step succeeds, wider ones are tried."""
 
     has_wide_gaps: bool  # whether the longest allowed time between evaluations is multiplied by GAP_FACTOR
     may_approach: bool  # whether a step may end before the singular position, but nearer to it than the step began
@@ -198,9 +198,9 @@ def renew_kit(run: Run) -> None:
 
 
 def cross_singularity(run: Run, past: list[TimedState]) -> tuple[Plan, Array]:
-    """Prepare steps across a singular position, see kernels/steps/crossing_step.py; return their plan and `control`.
+    """Prepare steps across a singular position, see kernels/steps/crossing_step.py; return their plan and settings.
 
-    Set the first step size, and list the polynomials to try in `run.origins`. `control`: array of settings that
+    Set the first step size, and list the polynomials to try in `run.origins`. The settings are the array `control` that
     `advance` reads. `past`: states of the last accepted steps, oldest first; may be empty.
     """
     a, clock = run.a, run.clock

@@ -201,7 +201,7 @@ def _is_equal(A, B):
 
 @merged
 def factor_schur_complement(f, w):
-    """Store in w.S the factors of G M^-1 G^T, unless M is constant and w.S holds those of this G; return a code."""
+    """Store in w.S the factors of G M^-1 G^T, unless it has them already (M constant, G unchanged); return a code."""
     is_constant = f.constant_mass == 1
     if is_constant and _is_equal(w.G, w.G_of_S):
         return DONE

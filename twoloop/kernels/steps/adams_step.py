@@ -63,7 +63,7 @@ THETA, N_OPTIONS = range(2)  # THETA: index in `options` of the tolerance of pro
     N_SCALARS,
 ) = range(8)
 # indices of rows in `memory`. PSI, NEW_PSI: times (s) from earlier states to the last one, and to the end of the step.
-# BETA: factors that adapt differences to the step size. G_VELOCITY, G_POSITION: their coefficients in v and q
+# BETA: factors that adapt differences to the step size. G_VELOCITY, G_POSITION: coefficients of the products in v, q
 PSI, NEW_PSI, BETA, G_VELOCITY, G_POSITION, C_AT_NODES, N_ROWS = range(7)
 
 

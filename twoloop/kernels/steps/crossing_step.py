@@ -34,7 +34,7 @@ CONVERGED_CHANGE = 0.01  # the iteration has converged if a sweep changes accele
 # the iteration has also converged if a sweep changes accelerations by at most STALL_CHANGE tolerances, and by at least
 # STALL_RATIO times the change by the sweep before: rounding errors then keep the change from decreasing
 STALL_RATIO, STALL_CHANGE = 0.5, 0.3
-MAX_SWEEPS, FEW_SWEEPS = 40, 12  # a step fails after MAX_SWEEPS sweeps; after FEW_SWEEPS, it leaves out more nodes
+MAX_SWEEPS, FEW_SWEEPS = 40, 12  # a step fails after MAX_SWEEPS; after FEW_SWEEPS, it leaves out more nodes than before
 DISTANCE_FACTOR = 2.0  # after FEW_SWEEPS sweeps, the pivot below which nodes are left out is multiplied by this
 MAX_LEFT_OUT_NODES = 9  # a step fails if more nodes than this are left out
 # indices of the scalars at the end of `memory`. LARGEST_PIVOT to NODE_DISTANCE store arguments of `begin_polynomial`,
@@ -212,7 +212,7 @@ def _set_beginning_state(h, c0, weights_v, weights_q, a, q, v, q_0, v_0):
 
 @compiled
 def _interpolate(x, c, nodes, a, value):
-    """Set `value` (n) to the value at x of the polynomial that is a[k] (n) at c[k] for all k in `nodes` except -1."""
+    """Set `value` (n) to the value at x of the polynomial through a[k] (n) at c[k], for all k in `nodes` except -1."""
     value[:] = 0.0
     for node in nodes:
         if node >= 0:

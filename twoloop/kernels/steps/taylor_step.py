@@ -77,7 +77,7 @@ KIND, BEGIN, END, MORE_FIRST, _, MORE_SECOND, _, N_GROUP = range(8)
     ALLOWED_SIZE,  # largest step size that the series about the beginning of the step allows, in units of UNIT
     NEXT_ALLOWED_SIZE,  # largest step size that the series about the end of the last attempt allows, in NEXT_UNIT
     TRIED,  # 1: the last attempt has computed the series about its end, where the next step may begin; 0: it has not
-    PASSED,  # time (s) from the state about which the series was computed to the start of the step; 0 unless KEEP = 1
+    PASSED,  # time (s) from the expansion point of the series to the step; 0 unless steps share the series (KEEP = 1)
     TARGET,  # index (0 or 1) of the stored series that `compute_coefficients` overwrites
     # step sizes are multiplied by this factor (at most 1), so that steps end near the constraints; 0: unknown
     DISTANCE_FACTOR,
@@ -554,7 +554,7 @@ def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
             return Attempt(DONE, error, 1.0 / error)
         error = min(error, 1.0)
         was_near_singular = w.nearly_singular != 0.0  # True if the run is, or has been, near a singular position
-        # check no defect near a singular position: there, the series violates constraints, which spoils accelerations
+        # near a singular position, check no defect: small violations of constraints by the series spoil accelerations
         checks_defect = w.near_now == 0.0
         w.near_now = 0.0 if checks_defect else 2.0
         ratio_to_gap = gap_ratio(tolerances, h)
