@@ -457,7 +457,7 @@ class _Coordinate:
 
 GOLDEN_SECTION = 0.6180339887498949  # the multiples of this number, modulo 1, are spread evenly on [0, 1]
 MAX_PARTS = 1000.0  # a step is divided into at most this number of equal parts, between which defects are evaluated
-MAX_SERIES_OPERATIONS = 1500  # no code is generated for series with more operations; to compile 1500 takes some seconds
+MAX_SERIES_OPERATIONS = 1500  # no code is generated for series with more operations than this: compiling takes seconds
 
 
 class LaneCode(LaneSteps):

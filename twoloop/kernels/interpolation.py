@@ -26,7 +26,7 @@ MAX_VELOCITY_ROUNDING = 10.0
 SINGULAR_PIVOT_RATIO = 0.01
 SINGULAR_PIVOT = 1e-5
 # a position is also singular if its pivot ratio r is below WEAK_PIVOT, and r * (change of v by projection, in units of
-# the tolerances) below MAX_VIOLATION: this product is about the removed violation, which may then be due to rounding
+# the tolerances) is below MAX_VIOLATION: this product is about the violation removed, perhaps due to rounding only
 MAX_VIOLATION, WEAK_PIVOT = 10.0, 0.05
 
 

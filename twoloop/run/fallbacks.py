@@ -60,7 +60,7 @@ Array = NDArray[np.float64]
 N_CORRECTIONS = 3  # number of Newton steps that suffice to reduce errors of positions from the tolerances to rounding
 # in least-squares solutions, singular values up to this fraction of the largest count as zero (redundant rows)
 NEGLIGIBLE_RATIO = 1e-12
-UNIT_RATIO = 256.0  # units in which least-squares problems are solved are powers of this number
+UNIT_RATIO = 256.0  # the units of unknowns in least-squares problems are powers of this number
 MAX_RESIDUAL = 1e-8  # largest residual of the equations for v after a jump, relative to their right-hand side
 
 
@@ -108,7 +108,7 @@ def units_of_equations(mass: Array, rows: Array) -> Array:
     """
     inertia, is_coupled, is_linked = np.abs(np.diagonal(mass)), mass != 0.0, rows != 0.0
     # coordinates that M couples share their largest inertia: of a body's Euler parameters, one may have nearly none. A
-    # coordinate without inertia that M couples with no other takes the least inertia of those in its rows of G
+    # coordinate without inertia that M couples with no other takes the least inertia of coordinates in its rows of G
     has_others = is_coupled.sum(axis=1) > (inertia > 0.0)
     inertia = np.where(has_others, (is_coupled * inertia).max(axis=1), inertia)
     known = np.where(inertia > 0.0, inertia, np.inf)

@@ -31,7 +31,7 @@ RESTART_AFTER = 3  # number of successive rejected steps after which the method 
 
 # eight Gauss nodes on [0, 1] and their weights: this quadrature is exact for polynomials up to degree 15
 NODES, WEIGHTS = (0.5 * (1.0 + x) if k == 0 else 0.5 * x for k, x in enumerate(np.polynomial.legendre.leggauss(8)))
-POSITION_WEIGHTS = WEIGHTS * (1.0 - NODES)  # weights of the values of c(s) at NODES in the integral of (1 - s) c(s)
+POSITION_WEIGHTS = WEIGHTS * (1.0 - NODES)  # weights with which c(s) at NODES yields the integral of (1 - s) c(s)
 
 
 def _error_constants():
@@ -173,7 +173,7 @@ def _predict_state(memory, h, k, old, new, state, q1, v1, n):
     mean_v, mean_q = _scratch_rows(memory, n)
     for m in range(0, old.shape[1], 4):
         d0, d1, d2, d3 = old[N_TERMS, m], old[N_TERMS, m + 1], old[N_TERMS, m + 2], old[N_TERMS, m + 3]
-        # old[k] + d0 is phi_{k+1}, see `_difference_table`; row k + 1 of `new` serves to estimate errors of order k + 1
+        # old[k] + d0 is the difference phi_{k+1}; row k + 1 of `new` serves to estimate errors of order k + 1
         b = beta[k]
         new[k + 1, m] = -b * (old[k, m] + d0)
         new[k + 1, m + 1] = -b * (old[k, m + 1] + d1)

@@ -26,8 +26,8 @@ from twoloop.kernels.evaluation.inner_loop import evaluate_state, project, renew
 from twoloop.kernels.linalg.dense import copy, sum_rows
 from twoloop.kernels.steps.stages import lagrange_values
 
-# indices in `options`: tolerances of the inner loop and of projections. The Gauss tableau follows: A, A @ A, weights of
-# the Legendre coefficients (S, S each); b, b @ A, c (S each)
+# indices in `options`: tolerances of the inner loop and of projections. The Gauss tableau follows: first A, A @ A and
+# weights that yield Legendre coefficients (S, S each); then b, b @ A and c (S each)
 INNER_TOL, THETA, N_SCALARS = range(3)
 S = 20  # number of Gauss nodes, which are the stages
 CONVERGED_CHANGE = 0.01  # the iteration has converged if a sweep changes accelerations by at most this (in tolerances)
@@ -49,7 +49,7 @@ PROJECTION_WEIGHT = 0.5  # if a projection changes a stage by x tolerances, the 
 ROUNDING = 1e-13  # relative tolerance of the iteration in steps of fixed size, and of comparisons of times
 MIN_PIVOT_RATIO = 0.5  # a step fails if the pivot at its end is below this * pivot at its beginning; see FAR_END
 END_MARGIN = 2.0  # a step fails if the pivot at its end is below this * smallest pivot allowed at nodes; see FAR_END
-FAR_END = 0.3  # no step fails for the pivot at its end if that is at least this * largest pivot of the run so far
+FAR_END = 0.3  # the pivot at the end of a step is large enough if it is at least this * largest pivot of the run so far
 LATE = S - 4  # node near a polynomial's end: if its pivot exceeds the end's, the singular position lies beyond the end
 # an attempt that computes a polynomial returns this as error and as step-size factor. So the step is repeated; it then
 # follows the polynomial
@@ -87,7 +87,7 @@ def begin_polynomial(memory, largest_pivot, earliest, may_approach, node_distanc
 
 
 def piece_ends(memory, c, t):
-    """Divide the polynomial in `memory` into the next steps ("pieces"); return the times (s) after t at which they end.
+    """Divide the polynomial in `memory`, from t on, into steps ("pieces"); return the times (s) at which they end.
 
     Pieces end at the end of the polynomial, at evaluated nodes next to a node that is left out, and at evaluated nodes
     where the piece would otherwise be longer than LONGEST_PIECE. No piece is shorter than SHORTEST_PIECE.
@@ -314,7 +314,7 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
         if is_estimated:
             duration = h + max(0.0, min(h * BACKWARD_FRACTION / (1.0 - BACKWARD_FRACTION), t - earliest))
     begin, c0 = t + h - duration, (duration - h) / duration
-    c_base = c0 if t_base == t else 0.0  # time of the state `base`, as a fraction of the polynomial
+    c_base = c0 if t_base == t else 0.0  # time from the polynomial's beginning to `base` / its duration
     _fill_integral_weights(b, c, c_base, weights_v, weights_q)
     n_before_base = 0  # number of nodes before the state `base`
     while n_before_base < S and c[n_before_base] < c_base:
