@@ -70,7 +70,7 @@ def generated_functions(
     files, disk_key = _code_files(kind, stamp), _disk_key(key)
     try:
         names_and_content = files.load(disk_key)
-    except Exception:  # the file is incompatible, from another installation: compile, and overwrite it below
+    except Exception:  # another installation wrote an incompatible file: compile, and replace the file below
         names_and_content = None
     if names_and_content is None:
         names, text = write()
