@@ -149,8 +149,8 @@ CHUNK_TO_EVENT = 16  # attempted steps in a chunk if an event may end the run, b
 CHUNK_TIME = 0.05
 # statuses whose message may say that stability limited the steps
 STATUSES_WITH_STIFFNESS_NOTE = {Status.REACHED_END, Status.EVENT, Status.MAX_STEPS, Status.TIME_LIMIT, Status.STAGNATED}
-# the polynomial across a singular position may begin at one of the last N_RECENT states or, among N_LAST_STATES states,
-# at the end of one of the last N_RECENT long steps before these (steps of at least COLLAPSED_STEP * clock[H_LONG])
+# the polynomial across a singular position may begin at one of the last N_RECENT states, or at the end of one of the
+# N_RECENT last long steps (at least COLLAPSED_STEP * clock[H_LONG]) before these, within the last N_LAST_STATES states
 N_RECENT, N_LAST_STATES = 16, 256
 CROSSING_OVERSHOOT = 100.0  # a crossing step may end beyond t1 by at most this multiple of the run's duration
 NO_KINDS = np.zeros(0, dtype=np.int64)  # kinds of intervals if no states between steps are requested
@@ -413,7 +413,7 @@ class IntegrationLoop:
             self.latest_chunks[-1][1][-1, : len(row)] = row
 
     def _needs_substitute(self, in_crossing: bool) -> bool:
-        """Return whether another method must take over because steps became too small far from singular positions."""
+        """Return whether another method must take over because of STEP_TOO_SMALL far from singular positions."""
         run, a = self.run, self.run.a
         is_too_small = self.code == a.STEP_TOO_SMALL and run.control[a.MAY_SWITCH] == 1.0
         return is_too_small and not in_crossing and run.work.notes[indices.NEARLY_SINGULAR] != 1.0

@@ -134,7 +134,7 @@ def dependence(system: ConstrainedSystem, t: float, q: Array) -> Dependence | No
 def project_sparsely(
     system: ConstrainedSystem, t: float, q: Array, v: Array, check_assembly: bool
 ) -> tuple[Array, Array] | None:
-    """Return (q, v) projected by sparse factors; None on failure, or if other guesses may lead to another assembly."""
+    """Return (q, v) projected by sparse factors; None on failure, or if nearby guesses may end on another assembly."""
     form = fixed_order_form(system, t, q)
     if form is None:
         return None

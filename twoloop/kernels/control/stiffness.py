@@ -56,7 +56,7 @@ FIRST_ESTIMATE, BETWEEN_ESTIMATES = 100.0, 600.0
 N_POWER_ITERATIONS = 4  # power iterations by dF/dq in an estimate (F: accelerations), and at most this number by dF/dv
 NEGLIGIBLE_DAMPING = 1e-3  # power iterations by dF/dv (F: acceleration) end if eigenvalue * step size is below this
 ZERO_REPLACEMENT = 1e-3  # replaces zero components of the vector of a power iteration, whose largest component is 1
-URGENT_RATIO = 3.0  # a trial is urgent, at whatever cost, if step size * (largest rate) / stability limit exceeds this
+URGENT_RATIO = 3.0  # no cost delays a trial (it is urgent) if step size * (largest rate) / stability limit exceeds this
 # if Jacobians are computed by finite differences (about eight evaluations per coordinate), a trial that is not urgent
 # (see URGENT_RATIO) also waits until the run has cost this number of evaluations per independent coordinate
 MIN_COST_PER_COORDINATE = 64.0
@@ -261,7 +261,7 @@ def _has_small_vibrations(w, tolerances, state, rate):
 
 @compiled
 def _cost_of_run(w, options):
-    """Return the cost of the run so far, in evaluations of the equations; a Jacobian counts as options[MATRIX_COST]."""
+    """Return the cost of the run so far in evaluations of the equations; a Jacobian costs options[MATRIX_COST]."""
     return w.n_evaluations + options[MATRIX_COST] * w.n_jacobians
 
 
@@ -331,13 +331,13 @@ def _phase_to_begin(f, w, options, memory, tolerances, t, state, new_state):
         is_hidden = _has_small_vibrations(w, tolerances, state, memory[RATE])
         if not is_hidden:
             is_hidden = memory[RATE] > MIN_RATIO_TO_MOTION * _motion_rate(f, w, t, state, memory[RATE], Q, V, A)
-    # a costly run starts a trial at any largest rate: friction is stiff only while it reverses, and few estimates fall
-    # into this time. The condition cost > min_cost excludes short steps at the start, which make a run look costly
+    # a costly run starts a trial however small the largest rate is: friction is stiff only while it reverses, and few
+    # estimates fall into this time. Short steps at the start make a run look costly: so require cost > min_cost
     is_costly = is_cheap and cost > min_cost and counted > COST_OF_ANY_TRIAL * min_cost * (1.0 + memory[N_TRIALS])
     is_due = (
         h_rho > URGENT_RATIO or is_hidden or is_costly or (memory[N_ABOVE_LIMIT] >= options[N_ESTIMATES] and is_cheap)
     )
-    if is_cheap and h_rho <= 1.0:  # otherwise, keep the number: it may start a trial later
+    if is_cheap and h_rho <= 1.0:  # otherwise, keep N_ABOVE_LIMIT, which may start a trial later
         memory[N_ABOVE_LIMIT] = 0.0
     is_expensive = cost_per_second > MIN_GAIN * memory[COST_PER_SECOND]  # more than with the explicit method
     if (memory[PHASE] == EXPLICIT and is_due) or (memory[PHASE] == IMPLICIT and (h_rho < RETURN_BELOW or is_expensive)):
@@ -366,7 +366,7 @@ def commit_switching(f, w, options, memory, tolerances, accepted):
 
 @kernel(ATTEMPT)
 def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """Attempt a step by the active method; but first begin or end a trial of the other method, if it is due.
+    """Begin or end a trial of the other method if that is due; then attempt a step by the active method.
 
     A trial begins or ends only after accepted steps, and never with steps of fixed size. The memory of a method is set
     to zero when the method becomes active. Each method has its own parameters of step-size control.

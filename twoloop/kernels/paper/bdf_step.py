@@ -67,7 +67,7 @@ def _coefficient_row(memory, row):
 
 @inlined
 def _history_views(memory, n):
-    """Return views of `memory`: differences of the history and of the attempt, the prediction, its rate, scratch.
+    """Return views of `memory`: differences of the history and of the attempt, a prediction and its rate, and scratch.
 
     The first two are tables (N_DIFFERENCES, 2 n): row k contains the differences of order k of (q, v). `prediction` is
     the predicted (q, v) at the end of the step, and `rate` its time derivative (2 n each).

@@ -22,11 +22,11 @@ N_ROUNDING = 4
 # indices of scalars in `memory`. HAS_TRIAL: 1 if a step was attempted, else 0. H_TRIAL: size (s) of the attempted step.
 # HAS_PREVIOUS: 1 if a step was accepted, else 0. H_PREVIOUS: size (s) of the last accepted step
 HAS_TRIAL, H_TRIAL, HAS_PREVIOUS, H_PREVIOUS, N_MEMORY_SCALARS = range(5)
-# indices of blocks (s, n_q) in `memory`, a row for each stage. A_PREVIOUS: accelerations of the last accepted step.
-# A_TRIAL: of the attempted step. A_HALF: of a half step. Q_STAGE, V_STAGE: positions and velocities
+# indices of blocks (s, n_q) in `memory`, a row for each stage: accelerations in the last accepted step (A_PREVIOUS), in
+# the attempted step (A_TRIAL) and in a half step (A_HALF); positions (Q_STAGE) and velocities (V_STAGE)
 A_PREVIOUS, A_TRIAL, A_HALF, Q_STAGE, V_STAGE, N_BLOCKS = range(6)
-# indices of vectors (n_q) in `memory`: positions Q, velocities V, accelerations A. _FULL: at the end of the whole step.
-# _MID: after the first half step. _OLD: before an iteration. ROUNDING: first of N_ROUNDING vectors of rounding errors
+# indices of vectors (n_q) in `memory`: positions Q_, velocities V_ and accelerations A_ at the end of the whole step
+# (_FULL), after the first half step (_MID), before an iteration (_OLD); rounding errors (ROUNDING: first of N_ROUNDING)
 Q_FULL, V_FULL, Q_MID, V_MID, A_MID, Q_OLD, V_OLD, ROUNDING, N_VECTORS = (*range(8), 7 + N_ROUNDING)
 
 
@@ -118,9 +118,9 @@ def iterate_accelerations(f, w, options, tolerances, t, h, q, v, A_stage, Q_stag
     """Compute a step of size h from (q, v) by iterating on stage accelerations; return a code and `prediction_error`.
 
     A_stage (s, n) contains predicted accelerations on entry, and the solution on return; (q1, v1) becomes the end of
-    the step, on the constraints. The stages Q_j = q + c_j h v + h^2 sum_k (A A)_jk a_k and V_j = v + h sum_k A_jk a_k,
-    with the tableau A, c, then satisfy eq. (17) of the paper. For undamped systems, an iteration gains as much accuracy
-    as two by `iterate_first_order`. If `rounding` has rows, sums are compensated for rounding errors.
+    the step, on the constraints. The stages Q_j = q + c_j h v + h^2 sum_k (A A)_jk a_k and V_j = v + h sum_k A_jk a_k
+    (A, c: Butcher tableau) then satisfy eq. (17) of the paper. For undamped systems, an iteration gains as much
+    accuracy as two by `iterate_first_order`. If `rounding` has rows, sums are compensated for rounding errors.
     """
     s, A, A2, b, bA, c = tableau_of(options)
     n = q.size

@@ -156,7 +156,7 @@ def estimate_end_error(tolerances, options, h, state, new_state, A_stage):
     H_FACTORED,  # step size (s) for which the linear systems of Newton's method are factored; 0: no factors are stored
     CONTRACTION,  # ratio of the last correction of Newton's method to the one before
     HAS_DAMPING,  # 1: forces depend on velocities; 0: they do not, so that derivatives by velocities are zero
-    IS_SYMMETRIC,  # 1: Newton's matrix in diagonal_step.py is symmetric, with factors L D L^T; 0: with factors L U
+    IS_SYMMETRIC,  # 1: Newton's matrix in diagonal_step.py is symmetric, and factored as L D L^T; 0: factored as L U
     ERROR_DURATION,  # time (s) for which a velocity error changes positions, see velocity_errors.py; 0: unknown
     DERIVATIVES_RENEWED,  # 1: diagonal_step.py has computed new derivatives at the end of the step; 0: it has not
     N_MEMORY_SCALARS,

@@ -5,8 +5,8 @@ duration of e. J is the Jacobian of the equations of motion (q, v)' = (v, F), wh
 due to a force that jumps within a step lasts long and counts, and an error of fast vibrations hardly counts. There are
 two exceptions:
 
-- The duration is that of the fastest component of e. If a stiff damper acts besides a contact, the slow component of
-  e lasts much longer. A filter with the time constant of several steps removes all but the slow component.
+- The duration is that of the fastest component of e. If a contact and a stiff damper act at the same time, the slow
+  component lasts much longer. A filter with the time constant of several steps removes all other components.
 - If J was computed by finite differences before a contact began or ended, the duration is wrong, although Newton's
   method still converges. `derivatives_agree` detects this. (`w`: workspace, `f`: kit)
 """
