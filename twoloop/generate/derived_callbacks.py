@@ -101,7 +101,7 @@ def _missing_derivatives(equations: Equations, missing: Sequence[str]) -> dict[s
 
 Array = NDArray[np.float64]
 
-MAX_ENTRIES = 50_000  # callbacks are not compared with exact derivatives if G = [C_q; A] has more entries
+MAX_ENTRIES = 50_000  # callbacks are not compared with exact derivatives if G = [C_q; A] has more entries than this
 # callbacks and exact derivatives are compared at states displaced from the start: each coordinate by these multiples of
 # its typical magnitude, the time by these multiples of FIRST_TIME_SCALE
 DISPLACEMENTS = (0.0, 1e-3, 0.03)

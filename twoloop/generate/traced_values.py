@@ -105,7 +105,7 @@ class CallbackTraces:
     def difference(self, system: ConstrainedSystem, states: Array, everywhere: bool = True) -> str | None:
         """Return a message about the first difference of calls and traces at states [t, q, v], or None if they agree.
 
-        If `everywhere`, the trace must not be finite where a call returns NaN or inf; else such values are ignored.
+        If `everywhere`, the trace must not be finite where a call returns NaN or inf; otherwise ignore such values.
         """
         from twoloop.kernels.evaluation import checks as kernels
 
@@ -233,7 +233,7 @@ def states_near_start(t0: float, t1: float, q: Array, v: Array) -> Array:
 
 @cache
 def _random_directions(n_q: int) -> Array:
-    """Return random numbers between -1 and 1, shape (2: for q and v, N_NEARBY, n_q), the same in every call."""
+    """Return random numbers between -1 and 1, the same in every call: for q, then for v, an array (N_NEARBY, n_q)."""
     return np.random.default_rng(6).uniform(-1.0, 1.0, (2, N_NEARBY, n_q))
 
 
@@ -272,7 +272,7 @@ class CheckedRegion:
         return states[outside.any(axis=1)] if outside.any() else states[:0]
 
     def contains_parameters(self, parameters: Array) -> bool:
-        """Return whether all parameters are within the checked ranges, extended by the fraction MARGIN."""
+        """Return whether all parameters are within the ranges of earlier runs, extended by the fraction MARGIN."""
         if self._parameters is None:
             return False
         smallest, largest = self._parameters

@@ -78,13 +78,13 @@ from twoloop.run.singular_positions import TimedState, has_velocity_jump_at_end
 
 Array = NDArray[np.float64]
 
-MAX_STORED_SIGNALS = 3  # number of Ctrl-C signals that are stored; the next raises KeyboardInterrupt: no result
+MAX_STORED_SIGNALS = 3  # number of Ctrl-C signals that are stored; one more raises KeyboardInterrupt, without a result
 
 
 class Interrupts:
     """Handler of Ctrl-C during a run. It replaces Python's own handler, but never one that the user has installed.
 
-    The handler is active from `install_handlers` to `restore_handlers`. Before, Ctrl-C raises KeyboardInterrupt.
+    The handler is active from `install_handlers` to `restore_handlers`. Before that, Ctrl-C raises KeyboardInterrupt.
     """
 
     n_signals, _is_installed = 0, False  # n_signals: number of times that Ctrl-C was pressed
@@ -495,7 +495,7 @@ class IntegrationLoop:
         return list(zip(t.tolist(), table, strict=True))
 
     def _next_buffers(self) -> Buffers:
-        """Return buffers for the times, states and steps of a chunk; each attempt fills at most one row of each."""
+        """Return buffers for the times, states and steps of a chunk; a step attempt fills at most one row of each."""
         chunk, width = self.run.chunk, len(self.run.state)
         n_rows, n_steps = max(min(chunk, BUFFER_ROWS), LANES), max(min(chunk, BUFFER_STEPS), LANES)
         spare_buffers = _spare_buffers.pop((n_rows, n_rows * width, n_steps), None)

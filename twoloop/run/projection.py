@@ -166,8 +166,8 @@ def project_sparsely(
 def _nearby_guesses_match(projection: _SparseProjection, position: Array, change: Array) -> bool:
     """Return whether three guesses near a projected `position` lead to the same assembly as the user's guess.
 
-    `change`: displacement of the user's guess by its projection. The three guesses are displaced from `position` by -2
-    `change`, and by two random vectors of at most max|change|. A guess leads to the same assembly if the linearized
+    `change`: displacement of the user's guess by its projection. The three guesses are displaced from `position` by
+    -2 * change, and by two random vectors of at most max|change|. A guess leads to the same assembly if the linearized
     constraints predict where it is projected.
     """
     distance = float(np.abs(change).max())
@@ -191,7 +191,7 @@ CONVERGED_VIOLATION = 1e-2
 RANK_CUTOFF, LSTSQ_CUTOFF, REDUNDANT_CUTOFF = 1e-10, 1e-13, 1e-2
 # a dead centre is near if the ratio of the smallest to the largest singular value of C_q is at most this
 DEAD_CENTRE_RATIO = 0.01
-MAX_EQUAL_DISTANCE = 0.1  # two projected guesses are equal if distance / (largest change by projection) is at most this
+MAX_EQUAL_DISTANCE = 0.1  # projected guesses are equal if their distance / (largest change by projection) is below this
 MAX_CHANGE = 1e8  # the iteration has diverged if a coordinate changes by more than this, in its unit (`Scales.columns`)
 
 
@@ -411,8 +411,8 @@ def _describe_other_assembly(
         expected = q1 + displacement + _least_change(jacobian, free, -(jacobian @ displacement), cutoff)
         if distance(projected, expected) <= MAX_NONLINEARITY * float(np.abs(move).max()) and sign_at(projected) == sign:
             continue
-        # the prediction may be inaccurate only because constraints are curved. Then q1 with the dependent coordinates
-        # of `projected` is projected back to q1; otherwise, `projected` is on another assembly
+        # the prediction may be inaccurate only because constraints are curved. Then `mixed`, q1 with the dependent
+        # coordinates of `projected`, is projected back to q1. Otherwise, `projected` is on another assembly
         mixed = q1.copy()
         mixed[dependent_columns] = projected[dependent_columns]
         mixed_projected, excess, _ = _gauss_newton(system, t, mixed, np.array(dependent_columns, dtype=int), cutoff)
@@ -436,7 +436,7 @@ def _gauss_newton(
 ) -> tuple[Array | None, float, int]:
     """Change the `free` entries of q until it is consistent, by the Gauss-Newton method.
 
-    Return q (None: diverged), (violation / allowed violation) of q, and the number of iterations.
+    Return q (None if the iteration diverges), violation / allowed violation of q, and the number of iterations.
     """
     least_excess, best_q, guess = np.inf, q, q
     for iteration in range(1, MAX_ITERATIONS + 1):

@@ -166,8 +166,8 @@ def _largest_acceleration(system: ConstrainedSystem, t: float, q: Array, v: Arra
 def scaled_to_unit_masses(system: ConstrainedSystem, t: float, q: Array) -> tuple[Array, Array, Array, Array]:
     """Return M and the constraint Jacobian, both scaled, the divisors of rows, and the units of coordinates.
 
-    q_j is scaled as q_j / unit_j with unit_j = 1 / sqrt(M_jj), so that the diagonal entries of M become 1. With the
-    divisors, all rows of the Jacobian have the norm 1, except for rows that are small at this position only.
+    q_j is scaled as q_j / unit_j with unit_j = 1 / sqrt(M_jj), so that the diagonal entries of M become 1. After
+    division by the divisors, rows of the Jacobian have the norm 1, unless they are small only at this position.
     """
     mass, rows = system.mass(t, q), system.rows(t, q)
     inertia = np.abs(np.diagonal(mass))

@@ -144,7 +144,7 @@ def _target_triple() -> str:
 
 
 def _new_target_machine() -> Any:
-    """Return a new LLVM target machine for the processor for which numba compiles; each engine needs its own."""
+    """Return a new LLVM target machine for the processor for which numba compiles; each execution engine needs one."""
     options: dict[str, Any] = {"opt": 1}  # level 2 would compile a quarter longer, and not make generated code faster
     cpu_target.target_context.codegen()._customize_tm_options(options)
     return binding.Target.from_triple(_target_triple()).create_target_machine(**options)

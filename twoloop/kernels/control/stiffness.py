@@ -377,7 +377,7 @@ def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
         memory[T_BEGIN], memory[COST_BEGIN] = t, _cost_of_run(w, options)
         memory[NEXT_ESTIMATE] = w.n_evaluations + FIRST_ESTIMATE * options[COST_RATIO]
     if memory[MAY_ESTIMATE] == 1.0 and tolerances[ESTIMATE] == 1.0:
-        phase = -1  # phase that begins now; -1: the present phase continues
+        phase = -1  # new value of memory[PHASE]; -1: the value remains
         if memory[PHASE] == ON_TRIAL or memory[PHASE] == BACK_ON_TRIAL:
             phase = _judge_trial(w, options, memory, t)
         elif w.n_evaluations >= memory[NEXT_ESTIMATE]:
@@ -395,7 +395,7 @@ def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
     w.reuse = max(rule[REUSE_OF], w.rounded)
     if is_explicit:
         code, error, factor = f.attempt_first(f, w, options[N_OPTIONS:begin], first, t, h, tolerances, state, new_state)
-        # a step of fixed size that does not converge cannot be shortened: repeat it by the implicit method, now in use
+        # a step of fixed size that does not converge cannot be shortened: repeat it by the other method, now and later
         if code == OUTER_DIVERGED and tolerances[ESTIMATE] == 0.0 and f.form != FIXED_ORDER:
             _begin_phase(w, options, memory, IMPLICIT, t)
             second[:] = 0.0

@@ -79,7 +79,7 @@ ALL_TASKS = (*TASKS, *TASKS_OF_STARTS, *TASKS_OF_STAGES, *TASKS_OF_EXPLICIT, *TA
 CODE.add_llvm_functions(dict.fromkeys(ALL_TASKS, types.none(types.int64, VECTOR, VECTOR)))
 # signature of a method's step (code, settings, control, options, work, status, n_steps, within). In lanes with a run,
 # the function takes a step, sets ACCEPTED, and stores the final state in NEW, accelerations in A, multipliers in LAM.
-# If `within`, it takes no step: NEW becomes the state, not projected, at X (s) after the last accepted step began
+# If `within`, it takes no step: NEW becomes the unprojected state X seconds after the last accepted step began
 STEP = types.void(CODE, INTEGERS, *[VECTOR] * 3, *[INTEGERS] * 2, types.boolean)
 CODE.add_function("step", STEP)
 

@@ -26,7 +26,7 @@ END_ERROR_WEIGHT = 0.01
     INNER_TOL,  # tolerance of the inner loop
     OUTER_TOL,  # tolerance of the outer loop
     EXTRAPOLATION,  # factor 1 / (2^order - 1) in Richardson's extrapolation of the new state; 0: no extrapolation
-    OUTER_TEST,  # 1: the outer loop ends when all coordinates have converged; 0: when the independent ones have
+    OUTER_TEST,  # 1: the outer loop ends when all coordinates have converged; 0: when independent coordinates have
     POWER,  # order of the method minus 1, an exponent in `estimate_end_error`
     N_SCALARS,
 ) = range(7)
@@ -79,7 +79,7 @@ def middle_node(c):
 
 @compiled
 def interpolate(c, theta, A_stage, weights, a):
-    """Interpolate the stage accelerations A_stage (s, n) at the nodes c (s); store their values at theta in a (n).
+    """Interpolate stage accelerations A_stage (s, n) from the nodes c (s) to the time theta; store the result in a (n).
 
     Nodes and theta are times relative to the step size. `weights` (s) is scratch.
     """
@@ -146,15 +146,15 @@ def estimate_end_error(tolerances, options, h, state, new_state, A_stage):
 
 # indices of the scalars in `memory`, the array in which a method keeps data from step to step
 (
-    HAS_TRIAL,  # 1: a step was attempted (its stage accelerations are in the block TRIAL, except in diagonal_step.py)
+    HAS_TRIAL,  # 1: a step was attempted, with stage accelerations in TRIAL (except in diagonal_step.py); 0: none
     H_TRIAL,  # size of the last attempted step (s)
-    HAS_PREVIOUS,  # 1: the block PREVIOUS contains the stage accelerations of the last accepted step
+    HAS_PREVIOUS,  # 1: the block PREVIOUS contains the stage accelerations of the last accepted step; 0: it is empty
     H_PREVIOUS,  # size of the last accepted step (s)
     HAS_JACOBIAN,  # 1: Newton's method may use the stored derivatives of accelerations or forces; 0: compute new ones
     IS_FRESH,  # 1: the stored derivatives belong to the stages of this step; 0: to earlier stages, or to a step's end
     PARTITION_NUMBER,  # value of w.generation, which counts partitions, when the stored derivatives were computed
     H_FACTORED,  # step size (s) for which the linear systems of Newton's method are factored; 0: no factors are stored
-    CONTRACTION,  # ratio of the last correction of Newton's method to the one before
+    CONTRACTION,  # (last correction of Newton's method) / (the correction before it)
     HAS_DAMPING,  # 1: forces depend on velocities; 0: they do not, so that derivatives by velocities are zero
     IS_SYMMETRIC,  # 1: Newton's matrix in diagonal_step.py is symmetric, and factored as L D L^T; 0: factored as L U
     ERROR_DURATION,  # time (s) for which a velocity error changes positions, see velocity_errors.py; 0: unknown
@@ -273,7 +273,7 @@ def newton_options_index(s):
 
 @merged
 def count_systems(options, s):
-    """Return the number of linear systems of Newton's method: one for each real eigenvalue or complex pair of A."""
+    """Return the number of linear systems of Newton's method: N_REAL + N_PAIRS eigenvalues of the tableau's A."""
     offset = newton_options_index(s)
     return int(options[offset + N_REAL] + options[offset + N_PAIRS])
 
