@@ -495,7 +495,7 @@ class IntegrationLoop:
         return list(zip(t.tolist(), table, strict=True))
 
     def _next_buffers(self) -> Buffers:
-        """Return buffers for the times, states and steps of a chunk; a step attempt fills at most one row of each."""
+        """Return buffers for the times, states and steps of a chunk; attempted steps fill at most one row of each."""
         chunk, width = self.run.chunk, len(self.run.state)
         n_rows, n_steps = max(min(chunk, BUFFER_ROWS), LANES), max(min(chunk, BUFFER_STEPS), LANES)
         spare_buffers = _spare_buffers.pop((n_rows, n_rows * width, n_steps), None)

@@ -395,7 +395,7 @@ def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
     w.reuse = max(rule[REUSE_OF], w.rounded)
     if is_explicit:
         code, error, factor = f.attempt_first(f, w, options[N_OPTIONS:begin], first, t, h, tolerances, state, new_state)
-        # a step of fixed size that does not converge cannot be shortened: repeat it by the other method, now and later
+        # a step of fixed size that does not converge cannot be shortened: switch to the implicit method, and repeat it
         if code == OUTER_DIVERGED and tolerances[ESTIMATE] == 0.0 and f.form != FIXED_ORDER:
             _begin_phase(w, options, memory, IMPLICIT, t)
             second[:] = 0.0

@@ -146,7 +146,7 @@ def estimate_end_error(tolerances, options, h, state, new_state, A_stage):
 
 # indices of the scalars in `memory`, the array in which a method keeps data from step to step
 (
-    HAS_TRIAL,  # 1: a step was attempted, with stage accelerations in TRIAL (except in diagonal_step.py); 0: none
+    HAS_TRIAL,  # 1: a step was attempted, with stage accelerations in TRIAL (except in diagonal_step.py); 0: no step
     H_TRIAL,  # size of the last attempted step (s)
     HAS_PREVIOUS,  # 1: the block PREVIOUS contains the stage accelerations of the last accepted step; 0: it is empty
     H_PREVIOUS,  # size of the last accepted step (s)
