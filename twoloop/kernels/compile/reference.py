@@ -212,7 +212,7 @@ def _load_array(context: Any, builder: Any, typ: Any, pointer: Any, field: str) 
     }
     model = context.data_model_manager[kind]
     array = ir.Constant(context.get_value_type(kind), ir.Undefined)
-    for name, value in fields.items():  # so LLVM keeps the array in registers; numba's own function uses memory
+    for name, value in fields.items():  # LLVM keeps an array built like this in registers, not in memory
         index = model.get_field_position(name)
         element = ir.Constant(array.type.elements[index], None) if value is None else value
         array = builder.insert_value(array, element, index)
