@@ -260,7 +260,7 @@ def write(
     builder.ret(emit(emitter(builder), *builder.arguments))
 
 
-LARGEST_ANGLE = 1e6  # results with larger angles (rad) count as invalid: reducing these by HALF_PI is too inaccurate
+LARGEST_ANGLE = 1e6  # results with larger angles (rad) count as invalid: reducing such angles by HALF_PI is inaccurate
 HALF_PI = (1.5707963267948966, 6.123233995736766e-17)  # two numbers, whose sum is pi/2 to about twice double precision
 # coefficients of x^3, x^5, ... in sin x, and of x^4, x^6, ... in cos x, on [-pi/4, pi/4], from Moshier's Cephes, sin.c
 SINES = (

@@ -72,7 +72,7 @@ def trace(function: Callable[..., Any], t: Affine, *arguments: Any) -> Any:
             value = _CallbackCopier(lambda copy, _: copy).callback(function)(t, *arguments)
         except (Refusal, Untraceable) as refusal:
             raise Untraceable(f"{graph.refusal_reason or refusal}{source_location(refusal)}") from None
-        except Exception as error:  # a callback may raise anything on symbols
+        except Exception as error:  # with symbols, a callback may raise any exception
             if not graph.refusal_reason:
                 text = str(error).partition("\n")[0].replace("twoloop.generate.graph.", "").replace("Affine", "symbol")
                 text = f"it does not run on symbols in the place of t, q and v: {type(error).__name__}: {text}"

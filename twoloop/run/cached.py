@@ -80,7 +80,7 @@ N_FIRST_CHUNKS = 4
 N_SKIPPED_CALLS = 16  # after an exception in a callback, this number of calls do not use the cached integrator
 STEP_FIELDS = (*STEP_ARRAYS, "stats")  # fields of a result that are computed from the array of steps
 NON_STEP_DEFAULTS = {name: value for name, value in DEFAULTS.items() if name not in STEP_FIELDS}
-SHORT_RUN = 1e-3  # if the last run took less CPU time (s), measure elapsed time instead: reading that clock is faster
+SHORT_RUN = 1e-3  # if the last run took less CPU time (s), measure elapsed time: its clock is read faster
 HARMLESS = 0.01  # v0 need not satisfy the constraints exactly: projection may change v0 by this number of tolerances
 REACHED_END = Status.REACHED_END  # a global name is read faster than a member of an Enum
 
@@ -442,7 +442,7 @@ def _choice_as_array(choice: PivotChoice | None) -> tuple[NDArray[np.int64], flo
     """
     if choice is None:
         return np.zeros(0, dtype=np.int64), 1.0
-    # OF_PYTHON: if solutions are refined, kernels cannot repeat this choice at a new start: Python must choose
+    # OF_PYTHON: if solutions are refined, kernels cannot repeat this choice at a new start: Python must choose rows
     index = cached_run().OF_PYTHON if choice.is_refined else int(np.searchsorted(-MIN_PIVOTS, -choice.min_pivot))
     numbers = index, len(choice.rows), len(choice.added_rows), *choice.rows, *choice.added_rows
     return np.array(numbers, dtype=np.int64), (*choice.scales, 1.0)[0]

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 INTERRUPTED, STAGNATED, OUT_OF_TIME = -1, -2, -3  # end codes of a run, in addition to those that `advance` returns
-STAGNATION_STEPS = 20_000  # a run is checked for a stall once per (about) this number of accepted steps
+STAGNATION_STEPS = 20_000  # a run is checked for a stall whenever about this number of further steps is accepted
 # a run stalls if the rest of the run would take more than MAX_STEPS_LEFT steps (days of computing). It also stalls if
 # the rest would take more than STAGNATION_LEFT steps, and (mean step size) / (largest step size) < STAGNATION_PACE
 STAGNATION_PACE, STAGNATION_LEFT, MAX_STEPS_LEFT = 1e-3, 1e7, 1e11
@@ -86,7 +86,7 @@ INITIAL_FACTOR = 0.1
 MIN_ALIGNMENT = 0.9
 MIN_STEPS = 200  # after fewer accepted steps, a message does not mention stiffness
 # let h be the step size, and `rate` that of the fastest vibration or decay: a method is stable while h * rate <= limit.
-# Stability limited steps if the median of h * rate / limit over all samples is at least this; smooth motion: about 0.4
+# Stability limited steps if the median of h * rate / limit in all samples is this or more; 0.4 is typical otherwise
 MIN_STABILITY_RATIO = 0.45
 
 
@@ -174,7 +174,7 @@ def _dominant_eigenvalue(
 ) -> tuple[float, bool]:
     """Return |x| and whether x < 0, for the dominant eigenvalue x of dF/dq, or dF/dv if `by_v` (F: accelerations).
 
-    Use the coordinates `independent` (indices). `direction`: first vector of the power iteration, then the eigenvector.
+    Only the coordinates `independent` (indices) vary. `direction`: first vector of the iteration, then the eigenvector.
     """
     from twoloop.kernels.evaluation import tasks
 
@@ -279,7 +279,7 @@ def describe_rounding(run: "Run", states: list[TimedState], end: float) -> str:
 
 
 def describe_arrival(t: float, fixed: bool) -> str:
-    """Return the first sentence of the message of a run that reached its end; `fixed`: if step sizes were constant."""
+    """Return the first sentence of the message of a run that reached its end; `fixed`: whether all steps were equal."""
     return f"Reached the end, t = {t:g}{', with a constant step: no error was estimated' if fixed else ''}."
 
 

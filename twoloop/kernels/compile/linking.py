@@ -67,7 +67,7 @@ def add_signature(function: Dispatcher, signature: Any) -> None:
     (compiled,) = dispatcher.overloads.values()
     dispatcher._insert([each._code for each in signature.args], compiled.entry_point, False)
     dispatcher.overloads[signature.args] = compiled._replace(signature=signature)
-    description = copy(compiled.fndesc)  # numba reads the argument types from it to compile calls of the function
+    description = copy(compiled.fndesc)  # from this, numba reads the argument types to compile calls of the function
     description.argtypes = signature.args
     dispatcher.targetctx.insert_user_function(compiled.entry_point, description, [compiled.library])
 
@@ -99,7 +99,7 @@ _numba_basic_indexing: Any = arrayobj.basic_indexing
 def _emit_element_address(
     context: Any, builder: Any, kind: Any, array: Any, index_types: Any, indices: Any, **options: Any
 ) -> Any:
-    """Emit code for the address of an element of a contiguous array; for other arrays, call numba's own function."""
+    """Emit code for the address of an element of a contiguous array; for slices or other arrays, use numba's code."""
     is_element = len(indices) == kind.ndim and all(isinstance(each, types.Integer) for each in index_types)
     if kind.layout != "C" or not is_element or options.get("boundscheck"):
         return _numba_basic_indexing(context, builder, kind, array, index_types, indices, **options)
@@ -154,7 +154,7 @@ def _cached_inlined_code(self: Any, function: Any, enable_ssa: bool = False) -> 
         _inlined_code[function, enable_ssa] = _numba_inlined_passes(self, function, enable_ssa)
     self.flags.enable_ssa = enable_ssa
     code = copy(_inlined_code[function, enable_ssa])
-    code.func_id = FunctionIdentity.from_function(function)  # so that each copy has variables with other names
+    code.func_id = FunctionIdentity.from_function(function)  # so that variables of each copy have their own names
     return code
 
 

@@ -53,7 +53,7 @@ class Reference(types.Type):
         self.elements = {element: (array, i) for array, named in elements.items() for element, i in named.items()}
         self.functions: dict[str, Signature] = {}
         self.llvm_functions: set[str] = set()  # fields in `functions` whose functions are generated as LLVM code
-        self.offsets: dict[str, int] = {}  # index of a field's address in the table; sizes of an array follow
+        self.offsets: dict[str, int] = {}  # index of each field's address in the table; sizes of an array follow it
         self.n_words = 0  # length of the table so far
         self._addresses: Any = BoundedCache()  # addresses of machine code, by the tuple of all functions of a structure
         for field, kind in self.arrays.items():

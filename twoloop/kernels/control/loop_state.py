@@ -61,7 +61,7 @@ H_BEFORE, ERROR_BEFORE, N_PAST = range(3)
     BY_STATE,  # 1: a force may change suddenly with q or v: steps longer than SPACING sample the motion; 0: none does
     FIRST_GIVEN,  # 1: the user has chosen the first step size; 0: it is a guess, and may grow before a step is accepted
     MAX_EVALUATION_GAP,  # longest time in a step between two evaluations of the equations, relative to the step size
-    TAKES_MANY,  # 1: the method has a function `attempt_many`, which takes steps without checks between them; 0: none
+    TAKES_MANY,  # 1: the method has `attempt_many`, which takes steps without checks between them; 0: it does not
     CHECKS_WITHIN,  # 1: once a run has come near a singular position, check pivots of C_q within each step; 0: never
     N_CONTROL,
 ) = range(N_RULE, N_RULE + 25)
@@ -88,20 +88,20 @@ H, ERRORS, FAILURES, PARTITIONS, JACOBIANS, N_STEP_COLUMNS = range(6)
     JUMP_TO,  # end (s) of the short time span with the next known jump of a constraint rate (C_t, b)
     APPLIES_JUMP,  # 1: the next step ends at JUMP_TO, in the state that `new_state` already contains; 0: ordinary step
     JUMP_END,  # end (s) of the last step rejected with a very large error: a force may jump before this time
-    # fixed-order form: smallest pivot after the last accepted step, or after a later one that `ends_near_singular`
+    # fixed-order form: smallest pivot after the last accepted step, or after a later step that `ends_near_singular`
     PIVOT_HERE,
     # forces, C_t and b are sampled ahead of a step, at a fixed state (where the step starts) or along predicted motion
     SAMPLED_TO,  # time (s) of the last sample at a fixed state
     SAMPLED_EVERY,  # time (s) from one sample at a fixed state to the next, in the last set of samples
     WIDEST_SAMPLING,  # longest time (s) so far from one sample of the forces to the next
-    DISCONTINUITY,  # time (s) of the next sudden change in samples at a fixed state; infinite: none is known
-    DISCONTINUITY_OF_MOTION,  # time (s) of the next sudden change in samples along the motion; infinite: none is known
+    DISCONTINUITY,  # time (s) of the next sudden change that samples at a fixed state show; infinite: none is known
+    DISCONTINUITY_OF_MOTION,  # time (s) of the next sudden change that samples along the motion show; infinite: unknown
     COMPARED,  # start time (s) of the last short step that was searched for pulses of a force
     LAST_CHANGE,  # time (s) of the last sudden change of a force, C_t or b; -infinite: none
-    SHORTEST_CHANGE,  # shortest time (s) between sudden changes of forces, C_t or b, or of a pulse; infinite: unknown
+    SHORTEST_CHANGE,  # shortest time (s) from one sudden change of a force, C_t or b to the next; infinite: unknown
     MOTION_SAMPLED_TO,  # time (s) of the last sample along the motion
     SAMPLES_MOTION,  # 1 while callbacks are called at predicted states, where exceptions do not end a run; otherwise 0
-    # smallest ratio so far of the smallest to the largest pivot of [C_q; A], at output times and ends of fixed steps
+    # minimum of (smallest / largest pivot of [C_q; A]) over the output times and the ends of steps of fixed size so far
     PIVOT_AT_OUTPUT,
     # smallest pivot of C_q within steps taken while MAY_CROSS was SUSPENDED, divided by LARGEST_PIVOT; 0: no such step
     PIVOT_PASSED,

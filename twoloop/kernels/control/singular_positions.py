@@ -194,11 +194,11 @@ def check_partition(f, w, control, clock, size, at_output, state):
         # w.pivot was computed when the partition was chosen: an old value may hide that a singular position is near
         if renew_partition(f, w, clock[at.T], state[:n]) != DONE:
             return at.RANK_LOST
-        w.sensitivity = 1.0  # best value: `partition_is_poor` returns True sooner than with the present value
+        w.sensitivity = 1.0  # the least possible value, with which `partition_is_poor` returns True soonest
         if w.pivot < SINGULAR_PIVOT * clock[at.LARGEST_PIVOT]:
             w.nearly_singular = w.near_now = 1.0
     if short and size < MIN_STEP_NEAR_SINGULAR * clock[at.H_LONG] and w.nearly_singular == 1.0:
-        # steps of an implicit method may be so short because its partition was chosen at a distant state: renew it
+        # steps of an implicit method may be this short because its partition was chosen at a distant state: renew it
         if renew_partition(f, w, clock[at.T], state[:n]) != DONE:
             return at.RANK_LOST
         if control[at.MAY_CROSS] != 1.0 and w.pivot < UNDETERMINED_PIVOT * clock[at.LARGEST_PIVOT]:

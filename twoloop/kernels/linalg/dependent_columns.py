@@ -157,7 +157,7 @@ def _subtract_multiple(R, K, columns, row_sizes, column_sizes, union, r, j, i):
 
 @compiled
 def _eliminate(R, K, columns, row_active, row_sizes, column_sizes, union, i, k, j, l):
-    """Solve rows i, k of a pivot block for the coordinates j, l; eliminate these from all rows without a pivot yet."""
+    """Solve rows i, k of a pivot block for the coordinates j, l; eliminate these from all rows that lack a pivot."""
     row_active[i] = row_active[k] = 0
     n, is_single = _merge_columns(columns, row_sizes, i, k, union), i == k
     a, b, c, d = R[i, j], R[i, l], R[k, j], R[k, l]

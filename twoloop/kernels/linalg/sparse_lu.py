@@ -117,7 +117,7 @@ def fill_newton_matrix(program, mass, jacobian, K, D, z, stiffness, values):
 
 @compiled
 def factor(program, is_independent, values, sizes):
-    """Replace the matrix in `values` by its factors L U, 1/pivot on the diagonal; return False if a pivot is too small.
+    """Replace the matrix in `values` by its factors L U (diagonal: 1/pivot); return False if a pivot is too small.
 
     Redundant rows (0 in `is_independent`) have factors of 0, so that they do not affect solutions. `sizes` is scratch.
     """
