@@ -120,7 +120,7 @@ def _integrals(coefficients: Extended, z: Extended) -> tuple[Extended, Extended,
     return coefficients.T @ values[:N], coefficients.T @ single[:N] / 2, coefficients.T @ double / 4
 
 
-MAX_OPERATIONS = 5000  # equations with more operations get no collocation code: to compile it would take more than 2 s
+MAX_OPERATIONS = 5000  # equations with more operations than this get no collocation code: compiling would take over 2 s
 MIN_DIVISOR = 1e-300  # this replaces smaller divisors and smaller allowed errors, so that no division by zero occurs
 INVALID = -1.0  # returned by `find_defect` instead of a defect (at least 0), if accelerations cannot be computed
 INFINITE = float("inf")
@@ -467,7 +467,7 @@ class CollocationCode:
             v0, a0 = (num.load(num.pointer(state, i), m * self.n) for m in (1, 2))
             of_v = self._weighted_accelerations(emit, tables().velocities, a0, work, i)
             store_lanes(emit, emit.fma(h, of_v, emit.broadcast(v0)), num.pointer(work, k * LANES), self.spectrum_offset)
-        offset.add_incoming(integer(self.spectrum_offset), builder.block)  # the second pass reads velocities here
+        offset.add_incoming(integer(self.spectrum_offset), builder.block)  # offset of the velocities in the second pass
         builder.jump(loop)
         builder.position_at_end(after)
 

@@ -22,7 +22,7 @@ import numpy as np
 from twoloop.generate.graph import Affine, is_zero
 
 # accelerations are invalid if a step of refinement changes them by more than this fraction. The relative error after
-# refinement is usually the square of the change, and as large as the change only if a light body loses all digits
+# refinement is usually the square of the change, and as large as the change only if a light body's digits are all lost
 LARGEST_CHANGE = 1e-7
 
 

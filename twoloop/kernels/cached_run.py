@@ -72,9 +72,9 @@ def prepare_workspace(w, numbers, integers, pattern, q, accuracy, reuse):
 
 FIRST_STEP = 0.01  # first step size, relative to the shortest time scale of the initial motion, see _first_step_size
 MIN_FIRST_STEP = 1e4  # smallest first step size, in spacings of floating-point numbers at the start time
-MIN_GAP = 40.0  # the longest time between two evaluations is at least this number of spacings of floating-point times
+MIN_GAP = 40.0  # the allowed time between evaluations is at least this number of spacings of floating-point times
 SHORTEST_STEP = 1e-16  # a run fails if a step would be shorter than this fraction of the first step
-# if forces may change suddenly with q or v, the longest time (s) between two evaluations of the equations is this many
+# if forces may change suddenly with q or v, the allowed time (s) between two evaluations of the equations is this many
 # times shorter in steps that check their defect (DEFECT_GAP) than in other steps (GAP)
 GAP_RATIO = 10
 
@@ -137,7 +137,7 @@ def _is_within_bounds(t, rows, bounds):
 
 @kernel(types.void(MATRIX, INTEGERS, VECTOR, types.int64[:, ::1], types.boolean[::1]))
 def split_steps(steps, counts, h, changes, used_newton):
-    """Split the records of steps, `steps` (rows of out_steps, see loop_state.py), into arrays with an entry per step.
+    """Split `steps`, the records of steps (rows of out_steps, see loop_state.py), into arrays with one entry per step.
 
     `h` receives the step sizes (s), `used_newton` True for steps by Newton's method. The three rows of `changes` count
     events since the previous step: rejections by the error test, failed steps, and new partitions.

@@ -34,7 +34,7 @@ Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 MAX_DIVIDED_INTERVALS = 512  # when states within more intervals than this are cached, the cache is emptied
-MAX_ACCURATE_INTERVALS = 65536  # the set of intervals with accurate polynomials is emptied when it has more elements
+MAX_ACCURATE_INTERVALS = 65536  # the set of intervals with accurate polynomials is emptied when it is larger than this
 # a polynomial is accurate if it violates constraints and equations of motion by at most MAX_ERROR tolerances. Across a
 # singular position, velocity errors are ten times the violation: there the limit is MAX_ERROR_ACROSS tolerances
 MAX_ERROR, MAX_ERROR_ACROSS = 10.0, 1.0
@@ -367,7 +367,7 @@ class Interpolator:
     def interior_blocks(self, table: StateTable) -> Iterator[tuple[Array, Array]]:
         """Yield the states within all divided intervals, in blocks, so that the caller can store them in a file.
 
-        A block has times (m, parts + 1) and rows [q, v, a] (m, parts + 1, 3 n_q) of m intervals; NaN fills the rest.
+        A block has times (m, parts + 1) and rows [q, v, a] (m, parts + 1, 3 n_q) of m intervals; unused ones are NaN.
         """
         intervals = _interval_rows(table, np.arange(len(table.t) - 1))
         for block in _blocks_of_intervals(intervals):

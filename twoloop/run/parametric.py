@@ -114,7 +114,7 @@ class ParametricRun:
             traced.is_trusted = False
 
     def callbacks_agree(self, t0: float, q: Array, v: Array, t1: float, mass: Array, with_derivatives: bool) -> bool:
-        """Return whether callbacks agree with traces near the start, and M has the same structure as before.
+        """Return whether callbacks agree with traces near the start, and M has the structure that `shared` requires.
 
         The structure of M (`mass`: M at the start) is whether M is definite, and whether M is diagonal.
         """

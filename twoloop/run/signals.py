@@ -62,7 +62,7 @@ class SignalHandlers:
     def call_delayed(self) -> None:
         """Call the handlers whose calls were delayed; if a handler has raised an exception, raise it again."""
         while self._delayed_calls and self._handler_error is None:
-            # do not pass the signal's frame: it is in a compiler, so other SignalHandlers would delay the call again
+            # do not pass the signal's frame: it is in a compiler, so outer SignalHandlers would delay the call again
             self._call_handler(self._delayed_calls.pop(0), sys._getframe())
         if self._handler_error is not None:  # not reset here: `restore` raises it again if the caller catches it
             raise self._handler_error from None

@@ -48,7 +48,7 @@ CONVERGED, REJECTED, GUESSED, NOT_COMPUTED = range(4)
 # offsets of arrays that follow the single numbers
 POWERS = 32  # index of the first of eight numbers: powers 1 to 8 of (size of this step / size of the step before)
 SCALED = 40  # index of the first of eight products: (coefficient of the predicting polynomial) * (number in POWERS)
-MOVED = 48  # index of the first of eight numbers, one for each end of a step: max|dq|, where dq is its last correction
+MOVED = 48  # index of the first of eight numbers, one for each end of a step: max|dq|, where dq is the last correction
 VALID = 56  # index of the first of eight numbers, one for each end of a step: 1 if its projection converged, else 0
 DEFECTS = 64  # index of the first of eight numbers, one for each of successive steps: DEFECT of the step
 WEIGHTS = 72  # index of the first of n_q numbers, one for each coordinate: 1 / (allowed error of its velocity)

@@ -38,7 +38,7 @@ from twoloop.kernels.linalg.markowitz_lu import (
 
 RANK_TOLERANCE = 1e-11  # a pivot, or the ratio of the smallest to the largest pivot, counts as zero up to this limit
 PARTITION_CHANGED = -1  # return code: the task succeeded, as for DONE, and the partition has changed
-MAX_ROWS_ELIMINATED = 200  # with more independent rows, `min_pivot_ratio` saves time: it returns an earlier pivot
+MAX_ROWS_ELIMINATED = 200  # with more independent rows than this, `min_pivot_ratio` returns the last pivot to save time
 # a partition is poor if the sensitivity of dependent to independent coordinates exceeds its first value by this factor
 SENSITIVITY_GROWTH = 3.0
 
@@ -164,7 +164,7 @@ def _find_pivot_order(w, max_rank, max_rank_v):
 
 @compiled
 def smallest_pivot(f, w, t, q):
-    """Return the smallest pivot of C_q at (t, q), rows scaled to about 1; 0 if the rank is below the partition's."""
+    """Return the smallest pivot of C_q at (t, q), rows scaled to maxima 1; 0 if the rank is below the partition's."""
     rank = w.rows.size
     if rank == 0:
         return 1.0
@@ -213,7 +213,7 @@ def _adopt_pivot_order(w):
 
 @compiled
 def write_programs(w):
-    """Write programs that factor the dependent columns of the Jacobian w.G; return False if these are singular."""
+    """Write programs that factor dependent columns of the Jacobian w.G; return False if these columns are singular."""
     _record_columns_of_entries(w)
     w.factored = 0.0
     is_regular = make_program(w.G, w.pattern, w.rows, w.dependent, w.index, w.values)
@@ -224,7 +224,7 @@ def write_programs(w):
 
 @compiled
 def _record_columns_of_entries(w):
-    """For row i of w.pattern, store columns of ones in w.row_entries[w.row_entries[i] : w.row_entries[i + 1]]."""
+    """Store the columns of ones in row i of w.pattern as w.row_entries[w.row_entries[i] : w.row_entries[i + 1]]."""
     n_rows = w.Rate.size
     index = n_rows + 1
     for i in range(n_rows):

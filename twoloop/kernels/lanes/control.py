@@ -28,7 +28,7 @@ from twoloop.kernels.lanes.layout import (
 # - LEAST: the smaller one of the tolerances rtol and atol
 JUMP_RATIO, FIRST, LEAST, N_HEAD = range(N_RULE, N_RULE + 4)
 
-SUDDEN_ERROR = 10.0  # a rejected step with a larger error, in tolerances, is assumed to contain a jump of a force
+SUDDEN_ERROR = 10.0  # a rejected step with an error above this (in tolerances) is assumed to contain a jump of a force
 MAX_RATIO_AFTER_REJECTION = 0.95  # largest ratio of the next step size to a rejected step size
 # if a step would end before t1 by at most this fraction of the time left, the step is lengthened to end at t1
 END_ROUNDING = 1e-10
@@ -37,7 +37,7 @@ END_ROUNDING = 1e-10
 LIMIT_FACTOR = 0.7
 LIMIT_MEMORY = 10.0
 LEAST_FIRST_STEP = 20.0 * at.SHORTEST  # lower bound of the first step size, relative to |t0|
-MAX_REJECTED = 30  # a run with more successive rejected steps leaves its lane, because the motion may be stiff
+MAX_REJECTED = 30  # a run with more than this number of rejected steps in a row leaves its lane, as it may be stiff
 MAX_STEPS = 100_000  # largest number of steps of a run in a lane: the user cannot interrupt runs in lanes
 
 
@@ -129,7 +129,7 @@ def set_end(work, control):
 
 @compiled
 def end_steps(code, settings, control, work, predicted_v):
-    """Project NEW, the state at the end of the step, onto the constraints; include the change of NEW in ERROR.
+    """Project NEW, the state at the end of the step, onto the constraints; include this change in the estimate ERROR.
 
     Changes by the projection show two errors: the largest change of a velocity, in tolerances, and PREDICTION_ERROR,
     which measures the change of positions. ERROR becomes the largest of these and the method's error estimate. So a

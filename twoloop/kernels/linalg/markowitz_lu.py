@@ -19,7 +19,7 @@ MAX_SPARSE_ROWS = 3  # matrices of at most this number of rows have sparse facto
 ZERO_PIVOT = 1e-11  # if |pivot| is at most this fraction of the largest |pivot| before it, the matrix is singular
 # if a program for r rows needs more than MIN_SUBTRACTIONS + SUBTRACTIONS_PER_ROW * r subtractions, factors are dense
 MIN_SUBTRACTIONS, SUBTRACTIONS_PER_ROW = 2000, 100
-MAX_ENTRIES_PER_LINE = 64  # if a row or column of sparse factors would have more entries, dense factors are used
+MAX_ENTRIES_PER_LINE = 64  # if a row or column of sparse factors would have more entries than this, factors are dense
 
 ORDER_CHOSEN, SINGULAR_MATRIX, TOO_MANY_ENTRIES = range(3)  # codes of `choose_order`; the last: use dense factors
 
@@ -119,8 +119,8 @@ def index_of_entries(r):
 def views_of_lists(index, values):
     """Return views of the scratch for choosing an order: counts (N_COUNTS, r), lists (N_LISTS, r, w), numbers (r, w).
 
-    r: number of rows; w: largest number of entries in a row or column; counts: see ROW_SIZE; lists: see COLUMNS.
-    `numbers` contains the values of the entries of each column.
+    r is the number of rows, w the largest number of entries in a row or column. For counts see ROW_SIZE, for lists see
+    COLUMNS. Row j of `numbers` contains the values of the entries in column j.
     """
     r = index[SIZE]
     width = min(r, MAX_ENTRIES_PER_LINE)
@@ -274,7 +274,7 @@ def _sort_row(columns, sources, size, position):
 
 @compiled
 def _sort_and_count(rows, counts, lists):
-    """Sort each row's entries by the order of elimination; return the number of all entries, and that of subtractions.
+    """Sort each row's entries by the order of elimination; return the numbers of all entries and all subtractions.
 
     counts[ACTIVE_ROW_SIZE, k] becomes the number of entries of row k of U, without the diagonal.
     """
