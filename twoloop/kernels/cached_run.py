@@ -83,8 +83,8 @@ GAP_RATIO = 10
 def _first_step_size(state, n, t, span, smallest):
     """Return the first step size (s): FIRST_STEP times the shortest time scale of the motion from `state` [q, v, a].
 
-    The time scales are the duration `span` (s) of the run, the times in which q changes by the larger one of max|q| and
-    `smallest`, and the time in which v changes by max|v|. The step has at least MIN_FIRST_STEP spacings of times at t.
+    The time scales are the run's duration `span` (s), the times in which v or a changes q by max(max|q|, `smallest`),
+    and the time in which a changes v by max|v|. The step has at least MIN_FIRST_STEP spacings of times at t.
     """
     distance, speed, acceleration = smallest, 0.0, 0.0
     for j in range(n):
@@ -125,7 +125,7 @@ def first_step_and_limits(control, tolerances, state, n, t, t1, smallest, longes
 
 @merged
 def _is_within_bounds(t, rows, bounds):
-    """Return True if, at all times t[k], each number of [t[k], rows[k]] is between those in bounds[0] and bounds[1]."""
+    """Return True if, for all k, each number of [t[k], rows[k]] is between its limits in bounds[0] and bounds[1]."""
     for k in range(t.size):
         if not bounds[0, 0] <= t[k] <= bounds[1, 0]:
             return False
@@ -160,9 +160,9 @@ UNCHOSEN = -4  # returned code: no steps were taken; Python must check whether t
 NOTHING_CHECKED, STATE_CHECKED, CHOICES_CHECKED = 0, 1, 2
 
 # arrays of a run, which later runs with the same options reuse. Among them are
-# - `numbers`: one array with the parts clock, control, tolerances; `start_numbers`: `numbers` before a run
+# - `numbers`: one array with the parts clock, control, tolerances; `start_numbers`: values of `numbers` before a run
 # - `start_memory`: numbers that the method's `memory` contains before a run, at the indices `memory_places`
-# - `last_start`: t, t1, q and v of the last start; `start_rows`: indices of the independent constraint rows there
+# - `last_start`: a count (N_EQUAL), then t, t1, q, v of the last start; `start_rows`: indices of its independent rows
 # - `saved`, `saved_integers`: all data computed at a start; if more runs begin at this start, they restore these data
 RUN_ARRAYS = Reference(
     "RunArrays",
@@ -201,9 +201,9 @@ RUN_ARRAYS.add_function("advance", i8(KIT, WORK, *(VECTOR,) * 9, MATRIX, MATRIX,
     FIRST_SIZE,  # first step size (s) that the user has chosen; 0: it is computed
     LEAST_DISTANCE,  # argument `smallest` of _first_step_size, the displacement that replaces a smaller max|q|
     LONGEST,  # longest step (s): argument `longest` of _set_step_limits
-    EVALUATES_WITHIN,  # 1: the method adds evaluations within long steps; 0: long steps are forbidden
+    EVALUATES_WITHIN,  # 1: the method adds evaluations within long steps; 0: it does not, which limits the step size
     NEAR_PIVOT,  # Python must check a run if, at an output time, (smallest / largest pivot of C_q) is below this
-    MAX_CHANGE_RATIO,  # velocities jump in a step if they change by more than this times (step size) times |a|
+    MAX_CHANGE_RATIO,  # velocities jump in a step if max|change| exceeds this * (step size) * max|a| at both ends
     MIN_SAMPLES,  # Python must check a run if sudden changes of a force, C_t or b are less than this many samples apart
 ) = range(18)
 # indices in `expected`, the choice of constraint rows for which code was generated (empty without generated code)

@@ -39,7 +39,7 @@ class Options:
 
     @cached_property
     def key(self) -> object:
-        """Key in caches of integrators: the same object for equal options."""
+        """Key of the options in caches of integrators; equal options have the same object as key."""
         step_options = self.first_step, self.max_step, self.max_steps, self.step_size
         tolerances = self.rtol, self.atol.tobytes()
         return _unique_key(identity(self.method), *tolerances, *step_options, self.compiled, self.check_derivatives)

@@ -3,7 +3,7 @@
 An offset is an index in this array, which begins at an aligned address. Quantities at the nodes of a step are stored
 as LANES numbers side by side, one for each node after the beginning. The ends of up to LANES successive steps are
 projected onto the constraints together: their quantities are stored as LANES numbers, one for each step. A sweep is one
-iteration for all stages. Only coordinates on which, or on whose velocities, accelerations depend are iterated.
+iteration for all stages. Coordinates are iterated only if accelerations depend on them or their velocities.
 """
 
 LANES = 8  # number of values, one in each SIMD lane, that are computed at once
@@ -24,7 +24,7 @@ CONVERGED, REJECTED, GUESSED, NOT_COMPUTED = range(4)
     TRIED,  # 1: of two stored polynomials, the one that is not CURRENT belongs to the step just attempted; 0: to none
     NEXT_DEGREE,  # degree of the polynomial that will predict the accelerations in the next step
     OLD_DEGREE,  # value of DEGREE before a rejected step; the next accepted step restores it; 0: nothing to restore
-    MAY_GUESS,  # 1: the step size is a guess, replaced if the iteration converges too fast or slowly; 0: it is final
+    MAY_GUESS,  # 1: the step size is a guess, replaced if RHO is not from FAST_START to SLOW_START; 0: it is final
     N_MASS_FIRST,  # number of steps left in which elimination begins with the mass matrix, as a pivot was too small
     N_GUESSES,  # number of guesses of the first step size so far
     N_STEPS,  # number of accepted steps since the method began

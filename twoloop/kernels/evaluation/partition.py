@@ -485,7 +485,7 @@ def find_null_space(f, w, t, q):
     """Store in w.D how dependent velocities follow from independent ones, by the factors of the Jacobian w.G.
 
     Row j of w.D contains the dependent velocities, without drives, if independent velocity j is 1 and the others are 0.
-    These rows span the null space of w.G. The last row: velocities due to drives if independent velocities are 0.
+    These rows span the null space of w.G. The last row contains dependent velocities due to drives alone.
     """
     if f.kinematics_given == 0 or w.has_gamma == 0.0:
         constraint_rates(f, w, t, q, w.Rate)

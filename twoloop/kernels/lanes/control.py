@@ -23,7 +23,7 @@ from twoloop.kernels.lanes.layout import (
 )
 
 # indices in `options`, after the N_RULE numbers of the step-size rule; the method's options begin at index N_HEAD
-# - JUMP_RATIO: assumed largest ratio of true error to error estimate in a step in which a force jumps
+# - JUMP_RATIO: (true error) / (error estimate) is assumed to be at most this in steps in which a force jumps
 # - FIRST: first step size, relative to the shortest time scale of the motion at the start
 # - LEAST: the smaller one of the tolerances rtol and atol
 JUMP_RATIO, FIRST, LEAST, N_HEAD = range(N_RULE, N_RULE + 4)

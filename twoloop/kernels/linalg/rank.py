@@ -146,7 +146,7 @@ def singular_values_exceed(rows, ratio, gram):
     return math.isfinite(total) and ldl_factor(gram)
 
 
-BOUND_ROUNDING = 1e-12  # a bound of pivots is reduced by this fraction, so that pivots equal to it count as above it
+BOUND_ROUNDING = 1e-12  # a bound of pivots is reduced by this fraction, so that a pivot equal to the bound is above it
 NOT_DEFINITE, STAYS_SINGULAR = -1, -2  # codes: M + sum s g^T g is not positive definite; no rows g make it invertible
 TINY = 1e-300  # replaces zero as a divisor
 # Limits that decide whether a row of G is independent of previous rows. S = G M^-1 G^T, scaled to a diagonal of 1, is
@@ -224,7 +224,7 @@ def _sort_rows_by_entries(G, order, counts):
 
 @merged
 def _removes_weak_eigenvalue(A, g, scale, x):
-    """Return True if adding scale * g^T g to the mass matrix M raises one of its eigenvalues above the limit z.
+    """Return True if adding scale * g^T g to the mass matrix M raises an eigenvalue of M above a limit z.
 
     Then det(M - z I) changes its sign. A: factors of M - z I; g: a row of the Jacobian; x: scratch.
     """
@@ -470,7 +470,7 @@ def choose_rows(original_mass, G, min_sine, weak_ratio, bounds, workspace, chose
         # the largest 1 / pivot becomes unknown (0) if there are redundant rows, because rows may have been exchanged
         largest_inverse = largest_inverse if n_kept == n_rows else 0.0
         first_bound = _first_bound_below_pivots(S, kept, n_kept, largest_inverse, bounds, scratch)
-        if first_bound < bounds.size:  # the chosen rows are certainly independent
+        if first_bound < bounds.size:  # all pivots exceed a bound: the chosen rows are certainly independent
             return first_bound
     _mark_independent_rows(G, min_sine, basis, factors, sizes, C, kept, order)
     chosen[0] = n_kept = _exchange_rows(C, order, kept)
