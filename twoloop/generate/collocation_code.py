@@ -108,10 +108,10 @@ def _legendre(z: Extended) -> Extended:
 
 
 def _integrals(coefficients: Extended, z: Extended) -> tuple[Extended, Extended, Extended]:
-    """Return three arrays: values, integrals and double integrals of the Lagrange polynomials (rows) at z (columns).
+    """Return the values, integrals and double integrals of the Lagrange polynomials (rows) at points z (columns).
 
     coefficients[k, j] is the coefficient of the Legendre polynomial P_k in the Lagrange polynomial of node j. The
-    points z are on [-1, 1]; integrals are over the time (z + 1) / 2, and begin at 0.
+    points z are on [-1, 1]. The variable of integration is the time (z + 1) / 2; integrals begin at time 0.
     """
     values = _legendre(z)
     # integral of the Legendre polynomial P_k from -1 to z: (P_k+1 - P_k-1) / (2 k + 1); if k = 0, it is P_1 + 1
@@ -120,7 +120,7 @@ def _integrals(coefficients: Extended, z: Extended) -> tuple[Extended, Extended,
     return coefficients.T @ values[:N], coefficients.T @ single[:N] / 2, coefficients.T @ double / 4
 
 
-MAX_OPERATIONS = 5000  # equations with more operations get no collocation code: to compile it would take more than 2 s
+MAX_OPERATIONS = 5000  # equations with more operations than this get no collocation code: compiling would take over 2 s
 MIN_DIVISOR = 1e-300  # this replaces smaller divisors and smaller allowed errors, so that no division by zero occurs
 INVALID = -1.0  # returned by `find_defect` instead of a defect (at least 0), if accelerations cannot be computed
 INFINITE = float("inf")
@@ -135,7 +135,7 @@ TARGET_SWEEPS = 6.0  # number of sweeps (iterations) in which a step should conv
 EXTRA_SWEEPS = 7  # a step is rejected if it has not converged after the target number of sweeps and this number more
 MAX_CONTRACTION = 0.8  # if changes by successive sweeps have at least this ratio in sweep 4 or later, reject the step
 MIN_RHO, MAX_RHO = 1e-3, 0.9  # the ratio rho of changes by successive sweeps is clipped to these bounds
-FAST_START, SLOW_START = 0.04, 0.3  # a guessed step size is kept if (change by sweep 2) / (by sweep 1) is in between
+FAST_START, SLOW_START = 0.04, 0.3  # keep a guessed step size if changes by sweeps 2 and 1 have a ratio between these
 STAGNATION_RATIO = 0.5  # sweeps also end if a change may be a rounding error, and is at least this * the change before
 # with steps of fixed size, sweeps (iterations) end if the error of the iteration is at most KAPPA_OF_FIXED * tolerance,
 # if changes are below ROUNDING_OF_FIXED * |v| (v: velocities) and decay no more, or after MAX_SWEEPS_OF_FIXED
@@ -185,7 +185,7 @@ class CollocationCode:
 
         if self.split_functions is None:
             programs = [*self.equations.accelerations, self.equations.position_projection, self.equations.projection]
-        else:  # equations are split into functions: `shared.digest` below covers all programs except this first one
+        else:  # if equations are split into functions, `shared.digest` covers all programs except the first one
             programs = self.equations.accelerations[:1]
         numbers = self.numbers
         description = [[each.sizes, *numbers.structure(each)] for each in programs]
@@ -271,7 +271,7 @@ class CollocationCode:
     def _evaluator(
         self, emit: LaneEmitter, work: Value, state: Value, index: int
     ) -> Callable[[list[Value]], Callable[[], Value]]:
-        """Return a function `evaluate` for `_iterate`, which writes calls of the program `accelerations[index]`."""
+        """Return the argument `evaluate` of `_iterate`: it writes calls of the program `accelerations[index]`."""
         accelerations = Emitter(emit.builder).pointer(work, self.a_offset)
 
         def evaluate(inputs: list[Value]) -> Callable[[], Value]:
@@ -447,10 +447,10 @@ class CollocationCode:
 
     @contextmanager
     def _repeated(self, emit: LaneEmitter, work: Value, state: Value) -> Iterator[list[Value]]:
-        """Return a context manager: code written in its block runs once in a sweep, or twice if the field REPEATS is 1.
+        """Return a context manager: the code of its block runs once in a sweep, or twice if the field REPEATS is 1.
 
-        The code computes accelerations from velocities that the context manager yields: in the first pass, velocities
-        of the last sweep; in the second, integrals of the first pass's accelerations, so that sweeps converge faster.
+        The code computes accelerations from velocities that the context manager yields. The first pass uses the
+        velocities of the previous sweep; the second integrates the accelerations of the first, to save sweeps.
         """
         builder, num, first_offset = emit.builder, Emitter(emit.builder), integer(self.v_offset)
         before, loop, repeat, after = builder.block, *(builder.append_block() for _ in range(3))
@@ -467,7 +467,7 @@ class CollocationCode:
             v0, a0 = (num.load(num.pointer(state, i), m * self.n) for m in (1, 2))
             of_v = self._weighted_accelerations(emit, tables().velocities, a0, work, i)
             store_lanes(emit, emit.fma(h, of_v, emit.broadcast(v0)), num.pointer(work, k * LANES), self.spectrum_offset)
-        offset.add_incoming(integer(self.spectrum_offset), builder.block)  # the second pass reads velocities here
+        offset.add_incoming(integer(self.spectrum_offset), builder.block)  # offset of the velocities in the second pass
         builder.jump(loop)
         builder.position_at_end(after)
 
@@ -665,7 +665,7 @@ class CollocationCode:
     def _project_in_parts(
         self, emit: LaneEmitter, work: Value, numbers: Value, write: Callable[..., Value], names: tuple[str, ...]
     ) -> None:
-        """Do the same as `_project` for equations that are split into functions; `write` writes calls of these."""
+        """Do the same as `_project` if equations are split into functions; `write` writes calls of these functions."""
         num, moved = Emitter(emit.builder), emit.builder.allocate(DOUBLE, LANES * self.n)
         indices = {name: num.pointer(work, index) for name, index in self._end_offsets().items()} | {"moved": moved}
         state = load_lanes(emit, work, self.end_offset), indices["q"], indices["v"]
@@ -749,7 +749,7 @@ class Collocation(NamedTuple):
 
     functions: DeferredFunctions
     code: CollocationCode
-    numbers: Any  # values of coefficients; in the object cached for all systems: expressions in the parameters
+    numbers: Any  # values of the coefficients, or (in the object cached for all systems) expressions for the values
 
 
 def compiled_collocation(generated: GeneratedCode) -> Collocation:

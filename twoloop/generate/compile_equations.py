@@ -36,8 +36,8 @@ from twoloop.kernels.compile.generated_functions import generated_functions
 from twoloop.problem.system import ConstrainedSystem
 
 DOUBLE_POINTER = f"{DOUBLE}*"
-# generated code is not used if the relative error of its accelerations near the start is larger. This is checked only
-# if rows of G are added to M, or solutions are refined (see PivotChoice). During runs, the error grew up to 200 times
+# generated code is not used if the relative error of its accelerations near the start exceeds LARGEST_LOSS. This is
+# checked only if PivotChoice has added rows, or refines solutions. During runs, the error grew by a factor of up to 200
 LARGEST_LOSS = 1e-8
 MAX_POSITIONS, SPACING = 4, 0.02  # number and spacing (m or rad) of positions that are tried to check LARGEST_LOSS
 
@@ -47,7 +47,7 @@ def write_accelerations(
 ) -> tuple[list[Value], Value]:
     """Write code for accelerations at `inputs`, [t, q, v]. Return the accelerations and a flag: 1 if they are valid.
 
-    `numbers`: the coefficients and their indices in an array; `emit` must have pointers to this array.
+    `numbers`: coefficients, each with its index in an array. `emit` must have pointers to this array.
     """
     lowering, n = Lowering(emit, numbers), equations.system.n_q
     for quantity, value in enumerate(inputs):
@@ -91,10 +91,10 @@ def _store_if_valid(emit: Emitter, is_valid: Value, pointers: Sequence[Value], a
 def call_accelerations(
     emit: Emitter, equations: Elimination, index: int, inputs: Sequence[Value], numbers: Coefficients, out: Value
 ) -> Value:
-    """Write a call of a function that stores accelerations at `inputs`, [t, q, v], in `out`; return a flag: 1 if valid.
+    """Write a call of the function that computes accelerations; return a flag: 1 if the accelerations are valid.
 
-    `index`: 0 for the program with the fewest operations, -1 for the elimination that begins with M. `numbers`: the
-    coefficients and their indices in an array.
+    `inputs`: t, q, v. The function stores the accelerations in `out`. `index`: 0 for the program with the fewest
+    operations, -1 for the elimination that begins with M. `numbers`: coefficients, each with its index in an array.
     """
     state = _stack_array(emit, 2 * equations.system.n_q)
     for i, value in enumerate(inputs[1:]):
@@ -108,8 +108,8 @@ def _accelerations(
 ) -> tuple[list[Value], Value]:
     """Write code for the accelerations; return the accelerations and a flag: 1 if they are valid.
 
-    `lowering`: Lowering in which t, q and v are defined. If pivots are small, the written code calls a function whose
-    elimination begins with M; `state()` returns the first arguments of this call: t, and pointers to q and v.
+    `lowering` writes operations; t, q and v are defined in it. If the accelerations are not valid, the code calls a
+    function whose elimination begins with M; `state()` returns the first arguments of this call: t, pointers to q, v.
     """
     program, *alternatives = equations.accelerations
     (a,) = program.run(lowering)
@@ -164,7 +164,7 @@ def _acceleration_function(emit: Emitter, equations: Elimination, index: int, nu
 
 
 def _coefficient_pointers(emit: Emitter) -> list[Value]:
-    """Return a pointer to all coefficients; in SIMD lanes, to those that vary between lanes and to the others."""
+    """Return a pointer to all coefficients; in SIMD lanes, two: to those that vary between lanes, and to the others."""
     constants = getattr(emit, "constants", None)
     return [emit.numbers] if constants is None else [emit.numbers, constants]
 
@@ -173,8 +173,8 @@ def _stack_array(emit: Emitter, size: int) -> Value:
     return emit.builder.allocate(DOUBLE, size * width_of(emit.double_type))
 
 
-# equations with more than a limit of operations are split into functions. If null_space.py yields a short program for
-# the accelerations, the limit is SPLIT_PROJECTIONS, and only projections are split: this halves the compile time. If
+# equations are split into functions if they have more operations than a limit. If null_space.py yields a short program
+# for accelerations, the limit is SPLIT_PROJECTIONS, and only projections are split: this halves the compile time. If
 # not, the limit is SPLIT_ALL, and accelerations are split, too: this makes them 50 % slower
 SPLIT_PROJECTIONS, SPLIT_ALL = 200, 500
 
@@ -228,7 +228,7 @@ class SplitFunctions:
         return list(functions)
 
     def _call(self, emit: Emitter, *calls: tuple[str, Sequence[Value]]) -> Value:
-        """Write calls (part, arguments), and the parts that the module lacks; return a flag: 1 if results are valid."""
+        """Write `calls` (function, arguments), and missing functions; return a flag: 1 if all results are valid."""
         module, all_valid = emit.builder.module, None
         for part, arguments in calls:
             name = f"{part}_{emit.suffix}"
@@ -241,7 +241,7 @@ class SplitFunctions:
         return all_valid
 
     def _lowering(self, emit: Emitter, graph: Graph, args: Sequence[Value], stored: Mapping[int, Location]) -> Lowering:
-        """Return a Lowering for the code of a part; `args` begin with three inputs and a pointer to coefficients."""
+        """Return a Lowering, which writes operations; `args` begin with three inputs and a pointer to coefficients."""
         *inputs, emit.numbers = args[:4]
         if width_of(emit.double_type) > 1:
             emit.constants = emit.numbers  # type: ignore[attr-defined]  # the coefficients are the same in all lanes
@@ -250,7 +250,7 @@ class SplitFunctions:
         return lowering
 
     def _write_factors(self, emit: Emitter, *arguments: Value) -> Value:
-        """Write the part "factors", which stores factors in `arguments[4]`; return a flag: 1 if no pivot is small."""
+        """Write code that stores the factors of [M G^T; G 0] in `arguments[4]`; return a flag: 1 if they are valid."""
         graph, solution, stored = self.equations.graph, self.solution, arguments[4]
         lowering = self._lowering(emit, graph, arguments, {})
         locations = {i: (stored, index) for i, index in solution.stored_indices.items()}
@@ -261,9 +261,9 @@ class SplitFunctions:
         return lowering.is_valid(solution.factor_program, [])
 
     def _write_part(self, program: Program, stored: Mapping[int, int], emit: Emitter, *arguments: Value) -> Value:
-        """Write a part that runs `program`; return a flag: 1 if its results are valid.
+        """Write code that stores the results of `program` in the last `arguments`; return a flag: 1 if they are valid.
 
-        The part loads the quantities in `stored` from the array `arguments[4]`; values of `stored`: their indices.
+        Keys of `stored`: quantities that the code loads from the array `arguments[4]`; values: indices in this array.
         """
         locations = {i: (arguments[4], index) for i, index in stored.items()}
         lowering = self._lowering(emit, program.graph, arguments, locations)
@@ -314,10 +314,10 @@ class SplitFunctions:
         new_v: Value,
         lam: Value,
     ) -> Value:
-        """Write code that projects q and v onto the constraints in the metric of M; return a flag: 1 if valid.
+        """Write code that projects q and v onto the constraints in the metric of M; return a flag: 1 if it succeeds.
 
         The code stores the change of q in `moved`, the projected q and v in `new_q` and `new_v`, and the accelerations
-        and multipliers at the new v in `a` and `lam`. `numbers`: pointer to the coefficients of the equations.
+        and multipliers at (q, new_v) in `a` and `lam`. `numbers`: pointer to the coefficients of the equations.
         """
         stored, r, c, change = self._stack_arrays(emit)
         projected_v, inputs = _stack_array(emit, self.n), [t, q, v, numbers, stored]
@@ -343,7 +343,7 @@ class SplitFunctions:
         return is_valid
 
     def _stack_arrays(self, emit: Emitter) -> list[Value]:
-        """Return four arrays: for factors of M a + G^T lam = r, G a = c; for r; for c; for lam, or a change of v."""
+        """Return scratch arrays for factors of [M G^T; G 0], right-hand sides r and c, multipliers or a change of v."""
         sizes = self.solution.n_stored, self.n, self.n_rows, max(self.n, self.n_rows)
         return [_stack_array(emit, size) for size in sizes]
 
@@ -394,7 +394,7 @@ class SharedCode:
     """Compiled functions for the equations of systems that differ only in parameters, cached on disk.
 
     numbers : coefficients of the equations, with their indices in the array from which the functions read them.
-    digest : key of cached functions, a digest of all that determines the functions except values of `numbers`.
+    digest : key of cached functions: digest of all that determines the functions, except the values of `numbers`.
     """
 
     def __init__(self, equations: Elimination, cache: TraceCache):
@@ -446,7 +446,7 @@ class GeneratedCode(NamedTuple):
     shared: SharedCode
     numbers: Array  # values of the coefficients that the code reads
     traced: CallbackTraces
-    evaluate: Evaluator  # computes expressions in the parameters, with the parameters of this system
+    evaluate: Evaluator  # evaluates expressions for the parameters of this system
 
     @property
     def kinds(self) -> frozenset[str]:
@@ -491,7 +491,7 @@ def _relative_error(code: GeneratedCode, system: ConstrainedSystem, t0: float, q
     """Return the relative error of accelerations by generated code, for velocities 0, at or near the start (t0, q0).
 
     At most MAX_POSITIONS positions are tried until pivots are large enough; if no position has such pivots, return
-    infinity. Two generated functions compute accelerations, one after a projection: return the larger error.
+    infinity. Two generated functions compute accelerations, one of them after a projection: return the larger error.
     """
     rows, n = list(code.shared.equations.choice.rows), system.n_q
     v, a, reduced, lam = np.zeros(n), np.empty(n), np.empty(n), np.empty(system.n_c + system.n_a)
@@ -512,7 +512,7 @@ def _relative_error(code: GeneratedCode, system: ConstrainedSystem, t0: float, q
         right, exact = np.concatenate([force, gamma[rows]]), np.zeros(n + len(rows))
         for _ in range(3):  # the first pass solves, the others refine the solution
             exact += np.linalg.solve(matrix, right - matrix @ exact)
-    except ValueError:  # gamma is not exact (by differences), forces are undefined, or the matrix is singular
+    except ValueError:  # gamma is known only by differences, forces are undefined, or the matrix is singular
         return 0.0
     heavy = mass.diagonal() > 0.0
     size = max(np.abs(exact[:n]).max(), np.abs(force[heavy] / mass.diagonal()[heavy]).max(initial=0.0))

@@ -20,7 +20,7 @@ from twoloop.generate.trace import GAMMA_SOURCES, Equations, Evaluator, TraceCac
 from twoloop.generate.traced_values import CallbackTraces, Check, accept_traces
 from twoloop.problem.system import ConstrainedSystem
 
-# keys: callbacks that are derived if the user does not give them; values: attribute that is their number of rows
+# callbacks that are derived if the user does not give them, with the attribute of the system that counts their rows
 DERIVABLE_CALLBACKS = {"jacobian": "n_c", "gamma": "n_c", "nonholonomic_gamma": "n_a"}
 
 
@@ -87,7 +87,7 @@ def _derive_programs(system: ConstrainedSystem, missing: Sequence[str], cache: T
 
 
 def _missing_derivatives(equations: Equations, missing: Sequence[str]) -> dict[str, dict[int, Affine]]:
-    """Return {index: expression} for "gamma" (rows of C, then of A) and "jacobian" (nonzero entries of flat C_q)."""
+    """Return {index in array: expression} for "gamma" (of C, then A) and "jacobian" (nonzero entries of flat C_q)."""
     system = equations.system
     gamma: dict[int, Affine] = {}
     for kind, first in (("gamma", 0), ("nonholonomic_gamma", system.n_c)):
@@ -101,7 +101,7 @@ def _missing_derivatives(equations: Equations, missing: Sequence[str]) -> dict[s
 
 Array = NDArray[np.float64]
 
-MAX_ENTRIES = 50_000  # callbacks are not compared with exact derivatives if G = [C_q; A] has more entries
+MAX_ENTRIES = 50_000  # callbacks are not compared with exact derivatives if G = [C_q; A] has more entries than this
 # callbacks and exact derivatives are compared at states displaced from the start: each coordinate by these multiples of
 # its typical magnitude, the time by these multiples of FIRST_TIME_SCALE
 DISPLACEMENTS = (0.0, 1e-3, 0.03)
@@ -158,7 +158,7 @@ def has_exact_derivatives(system: ConstrainedSystem, t: float, q: Array, v: Arra
 
 
 def generic_states(states: Sequence[tuple[float, Array, Array]]) -> Array:
-    """Return rows [t, q, v]: t and q of `states`; random velocities, about as large as those of `states` or larger."""
+    """Return rows [t, q, v] with t and q of `states`, and random v, whose max|v| is at least that of `states`."""
     times, positions, velocities = (np.array(values, dtype=float) for values in zip(*states, strict=True))
     generic_v = np.array([sizes(q) for q in positions]) * _random_factors(*positions.shape)
     scale = max(1.0, float(np.abs(velocities).max()) / float(np.abs(generic_v).max()))

@@ -1,4 +1,4 @@
-"""Eliminate the equations of one mechanism symbolically; the numbers at one position decide the order of elimination.
+"""Eliminate the equations of one mechanism symbolically; the values of M and G at one position decide the order.
 
 The matrix of
 
@@ -49,21 +49,21 @@ Array = NDArray[np.float64]
 SINGULAR_MASS = 1e-10  # M is singular if its smallest eigenvalue is below this fraction of its largest eigenvalue
 RANK_TOL = 1e-9  # a row g of G depends on others if the norm of its part orthogonal to them is below this * norm of g
 # the relative pivot of a row of G is its pivot / the pivot that it would have if G had no other rows. Results are
-# invalid if a relative pivot is below a limit, which is about this fraction of the smallest relative pivot at the start
+# invalid if a relative pivot is below a limit: about this fraction of the smallest relative pivot at a run's start
 PIVOT_FRACTION = 0.01
-MIN_PIVOTS = 10.0 ** np.arange(-2, -9, -1)  # possible limits of relative pivots; below these, rounding errors dominate
+MIN_PIVOTS = 10.0 ** np.arange(-2, -9, -1)  # possible limits of relative pivots; below 1e-8, rounding errors dominate
 # let p be the smallest relative pivot at the start. The limit of relative pivots during the run is MIN_PIVOTS[i] for
 # the first i with START_LIMITS[i] <= p; if there is no such i, the limit is MIN_PIVOTS[-1]
 START_LIMITS = MIN_PIVOTS[:-1] / PIVOT_FRACTION
-# M + s G^T G (s: scales of rows) replaces M on trial if the limit of relative pivots is as small as MIN_PIVOTS[i] with
-# i >= MIN_INDEX_FEW. This rule is for at most N_FEW_COORDINATES coordinates; if M is singular, MIN_INDEX_FEW_SINGULAR
-# replaces MIN_INDEX_FEW, as Euler parameters lose two digits even in sound models. For more coordinates, the code gets
-# longer, and i must be at least MIN_INDEX_MANY, or MIN_INDEX_MANY + 1 if M is singular
+# M + s G^T G (s: scales of rows) is tried in place of M if the limit of relative pivots is MIN_PIVOTS[i], and i is at
+# least a minimum. For up to N_FEW_COORDINATES coordinates, the minimum is MIN_INDEX_FEW or, if M is singular,
+# MIN_INDEX_FEW_SINGULAR, as Euler parameters lose two digits even in sound models. For more coordinates, the code would
+# get much longer: the minimum is MIN_INDEX_MANY or, if M is singular, MIN_INDEX_MANY + 1
 N_FEW_COORDINATES = 24
 MIN_INDEX_FEW, MIN_INDEX_FEW_SINGULAR, MIN_INDEX_MANY = 4, 5, 6
 ADDED_SIZE = 16.0  # scales s are chosen so that the largest entry of s G^T G is about this * the largest entry of M
 MAX_PIVOT_RATIO = 1e5  # solutions are refined if a diagonal entry of M + s G^T G is above this * the pivot of its row
-SCALE_STEP = 1024.0  # scales s of terms s g^T g in M differ by powers of this, so large that most starts share code
+SCALE_STEP = 1024.0  # ratios of scales s are powers of this large number: so runs from most positions share code
 DISPLACEMENT = 0.2  # displacement of coordinates (m or rad) to a position where no entry of M and G is zero by chance
 MIN_GAIN = 2  # M + s G^T G replaces M if the limit of relative pivots rises by at least this many powers of ten
 # dependent coordinates are eliminated (null_space.py) only if there are at least this many constraints per coordinate:
@@ -75,7 +75,7 @@ PivotBlocks = tuple[tuple[tuple[int, ...], tuple[int, ...]], ...]
 
 @dataclass(frozen=True)
 class PivotChoice:
-    """Choice of rows and pivots for the elimination, made by the numbers of M and G at one position.
+    """Rows and pivots of the elimination, chosen by the values of M and G at one position.
 
     rows : indices of the independent rows of G; the other rows are redundant.
     added_rows, scales : if M is singular or has little inertia about joints, M + sum_k scales[k] g^T g replaces M; g is
@@ -152,13 +152,13 @@ def _entry_kinds(system: ConstrainedSystem) -> Any:
 
     cache = shared_cache(system)
     kinds = cache.remembered("kinds of entries", partial(find_kinds, partial(cache.equations, system)))
-    if kinds is None:  # perhaps a callback branches on parameters: trace it with the numbers of this system
+    if kinds is None:  # perhaps a callback branches on parameters: trace it with the parameter values of this system
         kinds = system.remembered("kinds of entries", partial(find_kinds, partial(Equations, system)))
     return kinds
 
 
 class PivotChooser:
-    """Compiled search for the rows and pivots of the elimination, given the numbers of M and G at a position."""
+    """Compiled search for the rows and pivots of the elimination, given the values of M and G at a position."""
 
     def __init__(self, system: ConstrainedSystem):
         from twoloop.kernels.linalg.rank import choose_rows, workspace_size
@@ -172,7 +172,7 @@ class PivotChooser:
         self._last_key, self._last_choice = (0, b"", 0.0), PivotChoice((), (), (), 0.0)
 
     def choose(self, mass: Array, G: Array, nearby: Callable[[], tuple[Array, Array]]) -> PivotChoice:
-        """Return the PivotChoice for the numbers of M and G at a position; its pivot blocks are not chosen yet.
+        """Return the PivotChoice, but without pivot blocks, for the values of M and G at a position.
 
         `nearby` returns M and G at another position, where no entry is zero by chance. Raise Untraceable if M is
         singular on velocities that the constraints allow.
@@ -201,7 +201,7 @@ class PivotChooser:
     def _min_pivot_index(self, choice: PivotChoice, scales: Sequence[float], mass: Array, G: Array) -> int:
         """Return the index, in MIN_PIVOTS, of the limit of relative pivots for M + s g^T g (g: `choice.added_rows`).
 
-        Return -1 if M with added rows is not positive definite, or if the independent rows differ from `choice.rows`.
+        Return -1 if M + s g^T g is not positive definite, or if the independent rows differ from `choice.rows`.
         """
         scratch, chosen = np.zeros_like(self._scratch), np.zeros_like(self._row_indices)
         added = G[list(choice.added_rows)]
@@ -255,10 +255,10 @@ def _nearby(system: ConstrainedSystem, t: float, q: Array) -> tuple[Array, Array
 def _scale_factors(singular: Sequence[int], mass: Array, G: Array) -> Array:
     """Return for each row g of G a factor, by which the scale s is multiplied if s g^T g is added to M.
 
-    Without the factor, a row on Euler parameters alone, such as their norm, would hide the small inertia of a body
-    beside heavy bodies. `singular`: rows that are added because M is singular. The factor is a negative power of
-    SCALE_STEP if M is small in all columns in which g has nonzero entries, and the rows `singular` have nonzero entries
-    in all these columns, too. Otherwise, the factor is 1.
+    Without the factor, s g^T g would be as large as the inertia of heavy bodies. If g contains only Euler parameters of
+    a light body, as their norm does, rounding errors would then hide its inertia. `singular`: rows that are added
+    because M is singular. The factor is a negative power of SCALE_STEP if M is small in all columns in which g has
+    nonzero entries, and the rows `singular` have nonzero entries in all these columns, too. Otherwise, the factor is 1.
     """
     rows, covered = np.abs(G), np.any(G[list(singular)], axis=0)
     has_entry = rows > 0.0
@@ -283,24 +283,24 @@ def _may_lose_digits(choice: PivotChoice, mass: Array, G: Array) -> bool:
 
 MAX_OPERATIONS = 60_000  # no code is generated if the elimination takes more operations; 40 bodies in space need fewer
 # the elimination of dependent coordinates is compiled only if its cost is below this fraction of the cost of the
-# elimination that begins with M, which is always compiled. At a fraction of 0.68 (four-bar), it saves 5 % of a run
+# elimination that begins with M, which is always compiled. A fraction of 0.68 (four-bar) saves 5 % of a run's time
 MAX_COST_RATIO = 0.75
 
 
 class Elimination:
     """Symbolic elimination of the equations of a system, with the rows G = [C_q; A] of all constraints.
 
-    choice : rows and pivots, chosen by the numbers at one position.
+    choice : rows and pivots, chosen by the values of M and G at one position.
     equations : traced equations of the system, to whose graph the elimination adds its operations.
 
     Fields:
     graph : graph of the operations; its first inputs are t, q and v.
-    redundant_rows : program that computes only conditions, which hold if the redundant constraints are satisfied.
+    redundant_rows : program that only tests, by its conditions, whether a state satisfies the redundant constraints.
     split_functions : generator that splits long equations into several functions; compile_equations.py sets it.
     n_operations : number of operations of callbacks and factorization, but not of the solution with the factors.
     traced : traces of the callbacks.
 
-    Raises Untraceable if the equations cannot be generated; the message says why.
+    Raises Untraceable if no code can be generated for the equations; the message says why.
     """
 
     split_functions: Any = None
@@ -308,7 +308,7 @@ class Elimination:
     def __init__(self, system: ConstrainedSystem, choice: PivotChoice, equations: Equations | None = None):
         self.equations = Equations(system) if equations is None else equations
         self.system, self.choice, self.graph = system, choice, self.equations.graph
-        self.zero, self._n_reduced = Affine(self.graph, 0.0, {}), 0  # _n_reduced: number recorded for `reduced_program`
+        self.zero, self._n_reduced = Affine(self.graph, 0.0, {}), 0  # _n_reduced: operations added by `reduced_program`
         n, (self.q, self.v) = system.n_q, (self.equations.q, self.equations.v)
         self.mass = self._callback_terms("mass")
         rows = [self._callback_terms("jacobian"), self._callback_terms("nonholonomic")]
@@ -333,7 +333,7 @@ class Elimination:
         return elementwise(Affine.as_term, [self.equations.expressions(kind, v)])
 
     def _redundant_rows(self, rates: Any) -> Program:
-        """Return a program whose conditions hold if a state satisfies the redundant rows of C; `rates`: [C_t, b]."""
+        """Return a program with conditions that test if a state satisfies redundant rows of C; `rates`: [C_t, b]."""
         redundant = [k for k in range(self.system.n_c) if k not in self.choice.rows]
         violations = self._callback_terms("constraint")
         unit, conditions = Affine(self.graph, 1.0, {}), []
@@ -369,7 +369,7 @@ class Elimination:
         return matrix
 
     def _solve(self, r: Sequence[Affine], c: Sequence[Affine]) -> tuple[list[Affine], list[tuple[Affine, Affine]]]:
-        """Return [a, lam] that solve M a + G^T lam = r, G a = c (c: for all rows), and conditions of validity."""
+        """Solve M a + G^T lam = r, G a = c (c: all rows); return [a, lam] and conditions of validity (see Program)."""
         return solve_refined(self.factors.solve, self.choice, self.mass, self.all_rows, r, c)
 
     def _right_sides(self, v: Sequence[Affine]) -> tuple[list[Affine], list[Affine]]:
@@ -388,7 +388,7 @@ class Elimination:
 
     @cached_property
     def reduced_program(self) -> Program | None:
-        """Return a shorter program for accelerations: it eliminates dependent coordinates. None if it saves little."""
+        """Return a program that eliminates dependent coordinates; None if `mass_first_program` costs little more."""
         blocks = self.choice.blocks
         if not blocks:
             return None
@@ -414,13 +414,13 @@ class Elimination:
 
     @cached_property
     def right_sides(self) -> Program:
-        """Return the program for "r" (forces) and "c" in G a = c; c is 0 in redundant rows that are not added to M."""
+        """Return the program for "r" (forces), and "c" in G a = c: 0 in redundant rows outside `choice.added_rows`."""
         force, gamma = self._right_sides(self.v)
         used = {*self.choice.rows, *self.choice.added_rows}
         return Program(self.graph, {"r": force, "c": [x if k in used else self.zero for k, x in enumerate(gamma)]})
 
     def _accelerations(self, v: Sequence[Affine]) -> tuple[list[Affine], list[tuple[Affine, Affine]]]:
-        """Return [accelerations at velocities v, multipliers of independent rows], and conditions for these results."""
+        """Return [a, lam] at velocities v (lam: only of independent rows), and conditions of validity (see Program)."""
         return self._solve(*self._right_sides(v))
 
     def _expand_to_all_rows(self, independent: Sequence[Affine]) -> list[Affine]:
@@ -438,7 +438,7 @@ class Elimination:
 
     @cached_property
     def velocity_errors(self) -> Program:
-        """Return the program for "c" in G (change of v) = c; c is -(C_q v + C_t), -(A v + b); 0 in redundant rows."""
+        """Return the program for "c" in G (change of v) = c; c: -(C_q v + C_t), -(A v + b), or 0 in redundant rows."""
         errors = []
         for row, rate in zip(self.rows, self.rates, strict=True):
             total = rate
@@ -495,8 +495,8 @@ def multipliers_of_least_norm(
     """Return the multipliers lam (one per row) of least norm with the same G^T lam as the `independent` multipliers.
 
     `all_rows`: G. `rows`, `independent`: indices and multipliers of the independent rows. `solve`: solves with the
-    factors of [M G^T; G 0]. A redundant row i is a sum_k Z_ik g_k of independent rows g_k, so that the null space of
-    G^T is spanned by e_i - sum_k Z_ik e_k (e_i: unit vectors). The component of lam in this null space is subtracted.
+    factors of [M G^T; G 0]. A redundant row is g_i = sum_k Z_ik g_k, where g_k are independent rows. So the null space
+    of G^T is spanned by e_i - sum_k Z_ik e_k (e_i: unit vectors). The component of lam in this space is subtracted.
     """
     zero = Affine(graph, 0.0, {})
     lam = [zero] * len(all_rows)
@@ -572,7 +572,7 @@ class FactorAndSolvePrograms:
 
     @property
     def n_stored(self) -> int:
-        """Return the number of stored quantities."""
+        """Return the number of quantities that the first step stores."""
         return len(self.stored_indices)
 
     @cached_property

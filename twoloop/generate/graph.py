@@ -54,12 +54,12 @@ class Graph(SymbolicObject):
     def __init__(self) -> None:
         self.input_sizes: list[int] = []
         self.operations: list[tuple[int, Affine, Affine | None] | None] = []
-        self.is_late: list[bool] = []  # whether a quantity depends on inputs other than time and coordinates
+        self.is_late: list[bool] = []  # for each quantity, whether it depends on inputs besides time and coordinates
         self.input_masks: list[int] = []  # for each quantity, a bit mask of the inputs that it depends on
         self.traced: dict[str, Any] = {}
         self._recorded_quantities: dict[tuple[int, int, int], int] = {}
-        # place of each factor of products in the order of first use; keys: `identifier` of the factor. A product begins
-        # with the factor used first, so that the order of its factors does not depend on the values of parameters
+        # factors of products, numbered in the order of their first use; keys: results of `identifier`. A product begins
+        # with the factor of the lower number, so that the order of factors does not depend on values of parameters
         self._factor_order: dict[int, int] = {}
         self._identifiers: dict[Any, int] = {}  # results of `identifier`, by keys of expressions
         self._quantities: dict[int, Affine] = {}
@@ -155,7 +155,7 @@ class Graph(SymbolicObject):
         while stack:
             i = stack.pop()
             operation = None if i < 0 else self.operations[i]
-            if i < 0:  # ~i is a quantity whose arguments were above ~i on the stack: so they are in `order` now
+            if i < 0:  # the arguments of quantity ~i were above i on the stack, and are in `order` now
                 order.append(~i)
             elif i not in needed and operation is not None and i not in available:
                 needed.add(i)
@@ -164,7 +164,7 @@ class Graph(SymbolicObject):
         return order
 
     def product(self, a: "Affine", b: "Affine") -> "Affine":
-        """Return a * b, as a number times a product without constant factors, so that this product is recorded once."""
+        """Return a * b as a number times a recorded product; products that differ by a constant factor share one."""
         if not a.terms:
             return b.times(a.constant)
         if not b.terms:
@@ -183,21 +183,21 @@ class Graph(SymbolicObject):
         return self.operation(op.PRODUCT, a, b)
 
     def square(self, expr: "Affine", is_high_power: bool) -> "Affine":
-        """Return the square; `is_high_power`: whether it is a step to a power with an exponent above HIGH_EXPONENT."""
+        """Return the square of `expr`; if `is_high_power`, the recorded product keeps the constant factor of `expr`."""
         return self._product(expr, expr) if is_high_power and expr.terms else self.product(expr, expr)
 
 
 def rounded(value: float) -> Any:
-    """Return a number rounded to 41 bits (12 digits); for a Parameter, return its rounded scale and its `powers`."""
+    """Return a number rounded to 41 bits (12 digits); for a Parameter, return the pair (rounded `scale`, `powers`)."""
     if type(value) is Parameter:
         return rounded(value.scale), value.powers
     value = float(value)
-    scaled = 4097.0 * value  # Dekker's splitting: with the factor 2**12 + 1, the result below has 41 bits
+    scaled = 4097.0 * value  # Dekker's splitting: as 4097 = 2**12 + 1, the returned difference has 41 of 53 bits
     return scaled - (scaled - value)
 
 
 class Affine:
-    """Affine expression of quantities with the operators of a number, so that callbacks can run on expressions.
+    """Affine expression of quantities; it has the operators of a number, so that callbacks can run on it.
 
     An expression has no value that could be compared. While a callback runs on expressions, an operation raises an
     exception if it could reveal to the callback that an expression is not a number.
@@ -266,7 +266,7 @@ class Affine:
         for i, c in other.terms.items():
             total = terms[i] + c if i in terms else c
             if _magnitude(total) <= CANCELLATION_LIMIT * _magnitude(c):
-                terms.pop(i, None)  # no KeyError if i is not in terms, because a new c has underflowed to 0
+                terms.pop(i, None)  # `terms` need not contain i: a new coefficient c may have underflowed to 0
             else:
                 terms[i] = total
         if _equal(other.constant, 0.0):
@@ -472,10 +472,10 @@ class Derivative:
     def __init__(self, graph: Graph, direction: dict[int, Affine]):
         self.graph = graph
         self._derivatives = dict(direction)
-        self._input_mask = sum(1 << i for i in direction)  # bit mask of the inputs with components of the direction
+        self._input_mask = sum(1 << i for i in direction)  # bit mask of the inputs in `direction`
 
     def differentiate(self, expr: Affine) -> Affine:
-        """Return the derivative of an expression along the direction."""
+        """Return the derivative of an expression in the direction that the constructor was given."""
         total = Affine(self.graph, 0.0, {})
         for i, c in expr.terms.items():
             if self.graph.input_masks[i] & self._input_mask:
@@ -504,7 +504,7 @@ class Derivative:
         return self._derivatives[i]
 
     def _differentiate_operation(self, i: int, kind: int, first: Affine, second: Affine | None) -> Affine:
-        """Return the derivative, along the direction, of quantity i, the result of an operation on expressions."""
+        """Return the directional derivative of quantity i, the result of operation `kind` on `first` and `second`."""
         result, change = self.graph.quantity(i), self.differentiate(first)
         if kind == op.PRODUCT:
             assert second is not None

@@ -271,7 +271,7 @@ class LaneSteps:
             )
 
     def tolerances(self, emit: LaneEmitter, control: Value) -> tuple[Value, list[Value]]:
-        """Return rtol, and a list of atol for each coordinate, broadcast to all lanes."""
+        """Return rtol and a list of atol, one for each coordinate, all broadcast to the lanes."""
         atol = [broadcast_entry(emit, control, lanes.ATOL + j) for j in range(self.n)]
         return broadcast_entry(emit, control, lanes.RTOL), atol
 
@@ -315,9 +315,9 @@ SparseRows = list[dict[int, Value]]  # the nonzero entries of each row, by colum
 
 
 def orientation_change_mask(emit: LaneEmitter, before: SparseRows, after: SparseRows) -> Value:
-    """Return a mask of the lanes whose step may have passed a singular position, because det(G1 G0^T) <= 0.
+    """Return a mask of the lanes whose step may have passed a singular position, by the rows of C_q at both ends.
 
-    G0 (`before`) and G1 (`after`) are the rows of the constraints at both ends of the step. By the Cauchy-Binet
+    A lane is masked if det(G1 G0^T) <= 0, where G0 (`before`) and G1 (`after`) are the rows. By the Cauchy-Binet
     formula, the determinant is the inner product of the vectors of maximal minors of G0 and G1. If these vectors are
     similar, the determinant is positive. A step through a position at which the rows become dependent may lead to
     another assembly: then all minors change their signs. Lanes in which a pivot of G1 G0^T is zero are masked, too.
@@ -375,7 +375,7 @@ class LaneStages:
         return [np.asarray(each).tobytes() for each in self.tableau]
 
     def write(self, emit: LaneEmitter, arguments: tuple[Value, Value, Value], memory: LaneMemory) -> None:
-        """Write code that stores NEW, the state X (s) after a step began, and ERROR, valid at the end of the step."""
+        """Write code that stores the state NEW, X seconds after a step began, and the step's ERROR if it ends there."""
         A, b, c, fine_weights, coarse_weights = self.tableau
         _, control, work = arguments
         x, t = emit.load(work, lanes.X), emit.load(work, lanes.T)
@@ -445,7 +445,7 @@ class _Coordinate:
         return 1.0 / (atol + rtol * magnitude)
 
     def store_state(self, weights: Array, position_weights: Array, x: Value) -> tuple[Value, Value]:
-        """Write code for q and v of a stage; accelerations have `weights` in v, and `position_weights` in q."""
+        """Write code that stores q and v of a stage, computed with weighted accelerations, in NEW; return q and v."""
         emit, (q, v) = self.emit, self.old_state
         drift = float(weights.sum()) * v
         q = q + x * (drift + x * self.sum(position_weights))
@@ -457,7 +457,7 @@ class _Coordinate:
 
 GOLDEN_SECTION = 0.6180339887498949  # the multiples of this number, modulo 1, are spread evenly on [0, 1]
 MAX_PARTS = 1000.0  # a step is divided into at most this number of equal parts, between which defects are evaluated
-MAX_SERIES_OPERATIONS = 1500  # no code is generated for series with more operations; to compile 1500 takes some seconds
+MAX_SERIES_OPERATIONS = 1500  # no code is generated for series with more operations than this: compiling takes seconds
 
 
 class LaneCode(LaneSteps):
@@ -579,7 +579,7 @@ class LaneCode(LaneSteps):
         emit.store(builder.select(is_last, t1, t + h), work, lanes.T_NEW)
 
     def correct_positions(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Write code for a Newton step of NEW to C = 0 if ACTIVE = 1; ACTIVE and UNCONVERGED become 1 (valid) or 0."""
+        """Write code for a Newton step to C = 0 if ACTIVE = 1; ACTIVE, UNCONVERGED become 1 if it is valid, else 0."""
         is_active, _ = self._project(
             emit, self.equations.position_projection, lanes.ACTIVE, self.memory(emit, order, control, work)
         )
@@ -642,7 +642,7 @@ class LaneCode(LaneSteps):
         return is_valid, a
 
     def crossing_mask(self, emit: LaneEmitter, memory: LaneMemory) -> Value | None:
-        """Return `orientation_change_mask(...)`, or None for Taylor steps, whose defects show singular positions."""
+        """Return `orientation_change_mask(...)`; None without constraints, or if defects are checked (Taylor steps)."""
         if self.recurrences is not None or len(self.equations.rows) == 0:
             return None
         ends_of_step = (lanes.T, memory.state), (lanes.T_NEW, memory.new)
@@ -677,8 +677,8 @@ class LaneConstraints(LaneSteps):
 
     system : a system without nonholonomic rows.
     Fields:
-    pattern : sparsity pattern of C_q in one array. First, it has the index in this array at which the columns of each
-        row begin; then the length of the array; then the columns of the entries, row by row.
+    pattern : sparsity pattern of C_q in one array. It contains, in this order, the index at which the column indices of
+        each row begin in the array; the length of the array; and the column index of each entry, row by row.
     Raise Untraceable if the constraints cannot be generated; the message says why.
     """
 

@@ -45,14 +45,14 @@ class LaneEmitter(Emitter):
         super().__init__(builder, lanes)
 
     def coefficient(self, number: float) -> Value:
-        """Return `number` in all lanes; load a Coefficient: a vector if it varies between lanes, else a number."""
+        """Return `number` as a vector: equal in all lanes, unless it is a Coefficient that varies between lanes."""
         if not isinstance(number, Coefficient) or number.varies:
             return super().coefficient(number)
         pointer = self.builder.advance(self.constants, integer(number.index))
         return self.broadcast(self.builder.load(pointer, constant=True))
 
     def function(self, name: str, x: Value) -> Value:
-        """Return f(x) in each lane: by one LLVM intrinsic for all lanes, or else by a call of libm for each lane."""
+        """Compute the function `name` of x: by an LLVM intrinsic for all lanes, or else by a libm call in each lane."""
         if name in INTRINSICS:
             return super().function(name, x)
         result, scalar = undefined(self.double_type), Emitter(self.builder)
@@ -91,11 +91,11 @@ class LaneEmitter(Emitter):
         return power * self.polynomial(EXP2_COEFFICIENTS, x - whole)
 
     def minimum_or_nan(self, a: Value, b: Value) -> Value:
-        """Return the smaller one of a and b, or a if either is NaN."""
+        """Return the smaller one of a and b, but always a if a or b is NaN: so the result is NaN only if a is NaN."""
         return self.builder.select(self.builder.compare("fcmp ult", a, b), a, b)
 
     def maximum_or_nan(self, a: Value, b: Value) -> Value:
-        """Return the larger one of a and b, or a if either is NaN."""
+        """Return the larger one of a and b, but always a if a or b is NaN: so the result is NaN only if a is NaN."""
         return self.builder.select(self.builder.compare("fcmp ugt", a, b), a, b)
 
 
@@ -125,7 +125,7 @@ def two_sums(emit: LaneEmitter, a: Value, b: Value) -> list[Value]:
 
 
 def gather_lane(emit: LaneEmitter, vectors: Sequence[Value], lane: int) -> Value:
-    """Return a vector of the numbers that `vectors` have in lane `lane`; for a single vector, return this number."""
+    """Return a vector of the numbers in lane `lane` of each of `vectors`; for a single vector, return its number."""
     builder, indices = emit.builder, [lane, STAGES + lane]
     if len(vectors) == 1:
         return builder.extract(vectors[0], lane)
@@ -182,7 +182,7 @@ class LaneSeries:
         self.late = self._make_operations(program.late, first_result + len(program.early.first.column))
         self.rows = self._row_expressions(program.rows, program.row_indices)
         self.balance = self._row_expressions(program.balance, program.balance_indices)
-        # this dict is empty at first, because `_shared_sums`, which fills it, calls `_factors`, which reads it
+        # this dict is empty at first: `_shared_sums` returns its entries, but calls `_factors`, which reads the dict
         self._carried_sums: dict[int, tuple[int, int]] = {}
         self._carried_sums |= self._shared_sums()
         self.carried_pairs = sorted(set(self._carried_sums.values()))
@@ -207,7 +207,7 @@ class LaneSeries:
         return [self.n, self.n_rows, self.early, self.late, self.rows, self.balance, self.factor_indices]
 
     def _expressions(self, sums: Sums, rows: Sequence[int]) -> list[tuple[Terms, float]]:
-        """Return (terms, constant) of each expression in `sums`; `rows`: the expressions' numbers, as in `sums.row`."""
+        """Return (terms, constant) of each expression in `sums`; rows[k] is the number of expression k in sums.row."""
         more: dict[int, list[tuple[int, float]]] = {row: [] for row in rows}
         for row, i, c in zip(
             sums.row.tolist(), sums.further_column.tolist(), sums.further_coefficient.tolist(), strict=True
@@ -220,7 +220,7 @@ class LaneSeries:
         ]
 
     def _row_expressions(self, sums: Sums, indices: Any) -> list[tuple[int, tuple[Terms, float]]]:
-        """Return a pair for each equation: its index, from `indices`; (terms, constant) of its expression in `sums`."""
+        """Return the pair (indices[k], (terms, constant)) for each k: expression k in `sums` is equation indices[k]."""
         return list(zip(indices.tolist(), self._expressions(sums, indices.tolist()), strict=True))
 
     def _make_operations(self, table: OperationGroups, quantity: int) -> list[Operation]:
@@ -237,7 +237,7 @@ class LaneSeries:
     def _factor_index(self, *key: Any) -> int:
         """Return the index of a series that is a factor of products: row k stores its coefficient k at this index.
 
-        `key`, new or known: (terms, constant) of the series; or ("scaled", terms, constant) to store k * coefficient k.
+        `key`: (terms, constant) of the series, or ("scaled", terms, constant) if row k stores k times coefficient k.
         """
         return self.factor_indices.setdefault(key, len(self.factor_indices))
 
@@ -246,8 +246,8 @@ class LaneSeries:
 
         (cos x) x' is the derivative of sin x. So the sum for coefficient k + 1 of sin x, divided by the unit of time,
         is coefficient k of (cos x) x', except for the term that contains coefficient k of x', which is not known yet.
-        The same holds for (sin x) x' and cos x. Keys of the returned dict: index of the product among all quantities;
-        values: (index of X, index of Y) for the series X and Y in the sum of sin x or cos x, see `_factor_index`.
+        The sum for cos x serves for (sin x) x' in this way. In the returned dict, a key is the index of the product
+        among all quantities; the value (x, y) contains the indices of the two series in the sum, see `_factor_index`.
         """
         pairs: dict[Any, tuple[int, int]] = {}
         for operation in self.early:
@@ -344,7 +344,7 @@ class LaneSeries:
     def _write_order_0(
         self, emit: LaneEmitter, quantities: Quantities, operations: list[Operation], row: "_Row", scratch: Value
     ) -> None:
-        """Write code for coefficient 0 of arguments and results of `operations`; store those used by sums in `row`."""
+        """Write code for order 0 of arguments and results of `operations`; store coefficients of factors in `row`."""
         one, zero = emit.constant(1.0), emit.constant(0.0)
         for operation in operations:
             kind, results, first, second = operation
@@ -383,8 +383,8 @@ class LaneSeries:
         """Write loops for sums over 1 < j < k, and return the sums: of X[j] Y[k - j], and of X[j] Y[k + 1 - j].
 
         Keys of the returned dict: ((index of X, index of Y), True for Y[k + 1 - j] or False for Y[k - j]). For these
-        indices of series X and Y see `_factor_index`. `_PartialSums` adds the terms j = 1 and j = k later, as they need
-        the newest coefficients, for which the loops would wait. One loop computes several sums, to load data only once.
+        indices of series X and Y see `_factor_index`. `_PartialSums` adds the terms j = 1 and j = k later: these need
+        the newest coefficients, for which the loops would wait. One loop computes several sums, to load factors once.
         """
         keys = [(pair, True) for pair in self.carried_pairs]
         pairs = {pair for each in (*self.early, *self.late) for pair in self._factors(each)}
@@ -421,7 +421,7 @@ class LaneSeries:
     ) -> None:
         """Write code for Taylor coefficient k = `order` > 0 of the results of `operations`; `inverse`: 1 / k.
 
-        Coefficient k of the second factor of a PENDING product is not known yet: the term that needs it is left out.
+        A PENDING product has a second factor with an unknown coefficient k: the term with this coefficient is left out.
         """
         pairs = list(dict.fromkeys(pair for operation in operations for pair in self._factors(operation)))
         sums = {}
@@ -468,14 +468,14 @@ class LaneSeries:
 
 
 class _Row:
-    """Row in memory with the coefficients of one order, one for each factor; stored values are not loaded again."""
+    """Row k of the memory: coefficient k of each factor. `load` reuses values that `store` has written to the row."""
 
     def __init__(self, code: LaneSeries, emit: LaneEmitter, base: Value):
         self.code, self.emit, self.base = code, emit, base
         self._stored: dict[int, Value] = {}
 
     def store(self, key: Any, value: Value, when: str = "") -> None:
-        """Store the coefficient of the factor `key`; if `when` is "if used", only if a product has this factor."""
+        """Store the coefficient of the series `key`. If `when` is "if used", store it only for a factor of products."""
         index = self.code.factor_indices.get(tuple(key)) if when else self.code.factor_indices[tuple(key)]
         if index is not None and index not in self._stored:
             self._stored[index] = value
@@ -500,7 +500,7 @@ class _PartialSums(NamedTuple):
         return self.sums[pair, False] + emit.load(self.first_row, x) * self.row_before.load(y)
 
     def sum_of_next_order(self, pair: tuple[int, int], row: _Row) -> Value:
-        """Return the sum of X[j] Y[k + 1 - j] over 0 < j <= k; `pair`: indices of X and Y; `row`: coefficients k."""
+        """Return the sum of X[j] Y[k + 1 - j] over 0 < j <= k; `pair`: indices of X and Y; `row` has X[k] and Y[k]."""
         emit, (x, y) = self.row_before.emit, pair
         total = self.sums[pair, True] + row.load(x) * emit.load(self.first_row, y)
         return total + emit.load(self.row_1, x) * row.load(y)

@@ -58,7 +58,7 @@ class Emitter:
         self.suffix = f"v{lanes}f64" if lanes > 1 else "f64"
 
     def copy_for_builder(self, builder: Builder) -> Self:
-        """Return an emitter of the same class, for as many lanes, that writes to the function of `builder`."""
+        """Return an emitter of the same class and number of lanes, which writes to the function of `builder`."""
         return type(self)(builder, self.lanes)
 
     def broadcast(self, value: Value) -> Value:
@@ -186,7 +186,7 @@ class Emitter:
 
 
 class Quantities:
-    """Values of the quantities of a graph, and of linear combinations; each value is loaded or computed only once.
+    """Values of quantities (inputs, results of operations) and linear combinations, each loaded or computed only once.
 
     If a function is split into parts, each part loads quantities again, because keeping them in registers or on the
     stack would take longer. So the memory from which quantities are loaded must not change.
@@ -206,7 +206,7 @@ class Quantities:
         self._values[quantity] = value
 
     def value(self, quantity: int) -> Value:
-        """Return the value of a quantity: set by `define`, or else loaded, once in each part of a split function."""
+        """Return the value that `define` has set for a quantity, or else load it, once in each part of the function."""
         if quantity in self._values:
             return self._values[quantity]
         loaded = self._loaded_in_part()
@@ -219,7 +219,7 @@ class Quantities:
         self._loaded_in_part()[quantity] = self._values.pop(quantity)
 
     def _loaded_in_part(self) -> dict[int, Value]:
-        """Return the values loaded in the current part of the function, by quantity; an empty dict in a new part."""
+        """Return a dict {quantity: value} of the values that the current part of the function has loaded so far."""
         if self._part != self._emit.builder.part:
             self._part, self._loaded = self._emit.builder.part, {}
         return self._loaded
@@ -233,7 +233,7 @@ class Quantities:
         if key not in self._sums:
             total: Any = None if constant == 0.0 and terms else self._emit.coefficient(constant)
             half = len(terms) // 2 if len(terms) >= MIN_TERMS_SPLIT else 0
-            if half:  # the processor computes two independent chains of additions in parallel
+            if half:  # split the sum: the processor computes the sums of both halves in parallel
                 self._sums[key] = self._emit.add_sums(self.sum(terms[:half], constant), self.sum(terms[half:]))
                 return self._sums[key]
             for quantity, coefficient in terms:
@@ -260,7 +260,7 @@ def write(
     builder.ret(emit(emitter(builder), *builder.arguments))
 
 
-LARGEST_ANGLE = 1e6  # results with larger angles (rad) count as invalid: reducing these by HALF_PI is too inaccurate
+LARGEST_ANGLE = 1e6  # results with larger angles (rad) count as invalid: reducing such angles by HALF_PI is inaccurate
 HALF_PI = (1.5707963267948966, 6.123233995736766e-17)  # two numbers, whose sum is pi/2 to about twice double precision
 # coefficients of x^3, x^5, ... in sin x, and of x^4, x^6, ... in cos x, on [-pi/4, pi/4], from Moshier's Cephes, sin.c
 SINES = (

@@ -75,11 +75,11 @@ class Phi(Value):
         self.incoming: list[tuple[Value, Block]] = []
 
     def add_incoming(self, value: Value, block: "Block") -> None:
-        """Add the value that the node has if the program comes from `block`."""
+        """Add the value that the phi node takes if `block` was the last block before its own."""
         self.incoming.append((value, block))
 
     def line(self) -> str:
-        """Return the text of the instruction that defines the node."""
+        """Return the text of the instruction that defines the phi node."""
         pairs = ", ".join(f"[{value.text}, %{block.name}]" for value, block in self.incoming)
         return f"{self.text} = phi {self.type} {pairs}"
 
@@ -144,7 +144,7 @@ class Module:
 
     def __init__(self, splits_blocks: bool = False) -> None:
         self.splits_blocks = splits_blocks
-        self.block_addresses: list[str] = []  # addresses of parts of blocks that were split: LLVM must not merge these
+        self.block_addresses: list[str] = []  # addresses of parts of split blocks, stored so that LLVM keeps them apart
         self._tables: list[str] = []
         self._numbers: list[float] = []  # numbers that `Builder.load_constant` loads
         self._declared: dict[str, str] = {}

@@ -8,7 +8,7 @@ There are two methods:
   independent accelerations. The system (T^T M T) a_i = T^T (Q - M g) remains, which is small. This takes about half
   the operations of `Factors`, and M may be singular in directions that the constraints exclude.
 
-Pivots are chosen once. If a pivot of the second method becomes small during a run, generated code uses the first.
+Pivots are chosen once. If a pivot of `DependentCoordinates` becomes small in a run, generated code uses `Factors`.
 
 Light bodies beside heavy bodies cause pivots of very different size, and elimination loses digits. Then one step of
 refinement restores them: it solves the system again, with the residual of the solution as the right-hand side.
@@ -22,7 +22,7 @@ import numpy as np
 from twoloop.generate.graph import Affine, is_zero
 
 # accelerations are invalid if a step of refinement changes them by more than this fraction. The relative error after
-# refinement is usually the square of the change, and as large as the change only if a light body loses all digits
+# refinement is usually the square of the change, and as large as the change only if a light body's digits are all lost
 LARGEST_CHANGE = 1e-7
 
 
@@ -30,7 +30,7 @@ class Block(NamedTuple):
     """Pivot block of the factorization L D L^T: one or two rows that are eliminated together, with one division."""
 
     row_indices: tuple[int, ...]
-    inverse: list[list[Affine]]  # inverse of the 1x1 or 2x2 block of D
+    inverse: list[list[Affine]]  # inverse of this 1x1 or 2x2 block of the matrix D in L D L^T
     rows_below: list[tuple[int, list[Affine]]]  # index and entries of each nonzero row of L below the block
 
 
@@ -41,7 +41,7 @@ class Factors:
     conditions : for each row of G, a pair of positive expressions: the magnitude of its pivot, and the magnitude that
         this pivot would have if G had no other rows. If the first is less than a small fraction of the second, the row
         nearly depends on other rows, and results are invalid.
-    mass_pivots : all other pivots. If M is positive definite, the pivots in this list that vary are positive.
+    mass_pivots : all other pivots. If M is positive definite, each of them is positive or a constant number.
     """
 
     def __init__(self, matrix: dict[tuple[int, int], Affine], size: int, n: int):
@@ -73,7 +73,7 @@ class Factors:
     def _inverse(self, pivots: list[list[Affine]], own_pivots: list[Any]) -> list[list[Affine]]:
         """Return the inverse of a 1x1 or 2x2 pivot block, and append its pivots to `mass_pivots` or `conditions`.
 
-        `own_pivots`: for each row of the block, the pivot that it would have without other rows; None: no condition.
+        `own_pivots`: for each row, the pivot it would have if G had no other rows; None: `mass_pivots` gets its pivot.
         """
         diagonal = [None if pivot is None else pivot.as_term() for pivot in own_pivots]
         a = pivots[0][0]
@@ -192,8 +192,8 @@ PivotBlocks = Sequence[tuple[tuple[int, ...], tuple[int, ...]]]  # per block: in
 Terms = dict[int, Affine]  # nonzero entries of a row of a matrix; keys: column indices
 
 # accelerations are invalid if the square of one of these ratios is below this limit: a pivot / the norm of the entries
-# that it divides; a pivot / the norm of its column; the sine of the angle between the columns of a block of two rows. A
-# ratio 10^-k costs up to 3 k digits. The choice of pivots before a run (linalg/dependent_columns.py) is stricter
+# that it divides; a pivot / the norm of its column; the sine of the angle between the columns of a 2x2 block. A ratio
+# of 10^-k costs up to 3 k digits. The choice of pivots before a run (linalg/dependent_columns.py) is stricter
 MIN_PIVOT_SQUARE = 0.03**2
 
 
@@ -267,7 +267,7 @@ class DependentCoordinates:
             raise ReductionFailed
 
     def _inverse(self, block: list[list[Affine]]) -> tuple[Affine, list[list[Affine]]]:
-        """Return the determinant and inverse of a 1x1 or 2x2 block; raise ReductionFailed if the former is always 0."""
+        """Return determinant, inverse of a 1x1 or 2x2 block; raise ReductionFailed if the determinant is always 0."""
         if len(block) == 1:
             ((determinant,),) = block
         else:
@@ -338,13 +338,13 @@ def solve_reduced_system(
 
 
 def _pivot_conditions(matrix: dict[tuple[int, int], Affine], factors: Factors) -> Iterator[tuple[Affine, Affine]]:
-    """Yield pairs (pivot, small fraction of diagonal entry) of T^T M T (`matrix`): the pivot must be larger."""
+    """Yield a pair (pivot, lower limit) for each pivot of `matrix`, T^T M T, that is not a constant number."""
     pivots = iter(factors.mass_pivots)
     for row_indices, _, _ in factors.blocks:
         first_pivot: Affine | None = None
         for i in row_indices:
             pivot = next(pivots)
-            # the determinant of a block is its second pivot: so the diagonal entry is multiplied by the first pivot
+            # the second pivot of a block is its determinant, which has the first pivot as a factor: so has `scale`
             scale = matrix[i, i] if first_pivot is None else first_pivot * matrix[i, i]
             first_pivot = pivot
             if pivot.terms:
@@ -370,15 +370,15 @@ def solve_refined(
     r: Sequence[Affine],
     c: Sequence[Affine],
 ) -> tuple[list[Affine], list[tuple[Affine, Affine]]]:
-    """Return the solution (a, lam) of M a + G^T lam = r, G a = c, and conditions; improve it if `choice.is_refined`.
+    """Solve M a + G^T lam = r, G a = c for (a, lam); return this solution, and conditions under which a is accurate.
 
     `choice`: PivotChoice, which lists the independent rows; only these have a multiplier in lam. `mass`: M; `rows`: G.
     `solve`: function that solves linear systems with the matrix [M + S, G^T; G 0], where S is 0, or terms that make
     M definite (see PivotChoice).
 
-    If a step of refinement has improved the solution, there is one condition, otherwise none. The condition is a pair
-    of expressions: if the first is not larger than the second, refinement has changed a too much. The change is
-    compared with a and, as a is small near equilibrium, with the accelerations by the forces r without constraints.
+    If `choice.is_refined`, a step of refinement improves the solution. Then there is one condition, otherwise none: a
+    pair of expressions. If the first is not larger than the second, refinement has changed a too much, compared with a
+    and (as a is small near equilibrium) with the accelerations that the forces r would cause without constraints.
     """
 
     def solve_once(r: Sequence[Affine], c: Mapping[int, Affine] | Sequence[Affine]) -> list[Affine]:

@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 # product of powers as pairs (index of the base in ParameterTape.atoms, exponent); the empty tuple is the number 1
 Powers = tuple[tuple[int, float], ...]
 
-MAX_TERMS = 200  # a callback is not traced if a sum has more terms with parameters: long sums are slow to compare
+MAX_TERMS = 200  # largest number of terms with parameters in a sum of a traced callback: long sums are slow to compare
 _as_float = float.__pos__  # converts a Parameter to a float; float(x) raises an exception while callbacks are traced
 # the sum of two terms counts as zero if its magnitude is at most this fraction of the second term
 CANCELLATION_LIMIT = 8.0 * 2.0**-52
@@ -120,9 +120,9 @@ class ParameterTape(SymbolicObject):
         return lambda number: number.scale * product(number.powers) if type(number) is Parameter else number
 
     def product_evaluator(self, parameters: Array) -> Callable[[Powers], Any]:
-        """Return a function that evaluates Powers (products of powers of atoms) for given `parameters`.
+        """Return a function that evaluates Powers (products of powers of atoms: parameters, sums and functions).
 
-        If `parameters` is (n_runs, n_p), the function returns an array (n_runs,), or one number for all runs.
+        For `parameters` of shape (n_p,) it returns a number, for (n_runs, n_p) an array (n_runs,); but 1.0 for ().
         """
         atoms: dict[int, Any] = {}
         products: dict[Powers, Any] = {(): 1.0}
@@ -163,7 +163,7 @@ class ParameterTape(SymbolicObject):
 
 
 class Parameter(float):
-    """Float that records how it depends on parameters: scale * powers, a number times a product of powers of atoms."""
+    """Float that records its formula: a number (`scale`) times powers (`powers`) of parameters, sums and functions."""
 
     __slots__ = ("powers", "scale", "tape")
     tape: ParameterTape
@@ -327,12 +327,12 @@ for _symbol, _name in {"add": "add", "sub": "subtract", "mul": "multiply", "true
     setattr(Parameter, f"__{_symbol}__", _binary_operator(_name, False))
     setattr(Parameter, f"__r{_symbol}__", _binary_operator(_name, True))
 for _name in _UNARY_FUNCTIONS:
-    # np.sin of an array of objects calls the method `sin` of each object; likewise the other functions
+    # np.sin of an array of objects calls the method `sin` of each object; np.cos calls `cos`, and so on
     setattr(Parameter, _name, lambda self, name=_name: apply_function(name, self))
 
 
 def elementwise(function: Callable[..., Any], inputs: Iterable[Any], out: Any = None) -> Any:
-    """Apply a function to the entries of arrays, as a ufunc does; return the results, stored in out[0] if given."""
+    """Apply a function to the entries of arrays, as a ufunc does; return the results, in out[0] if `out` is given."""
     operands = list(map(_object_array, inputs))
     results = np.frompyfunc(function, len(operands), 1)(*operands)
     if out is None:

@@ -26,7 +26,7 @@ T = TypeVar("T")
 
 N_COMPARED = 5  # number of states at which a user's traced function is compared with calls of the function
 TIME_SPACING = 0.37  # time (s) between successive compared states; unlikely to be the period of a force
-MAX_TRACE_DIFFERENCE = 1e-10  # a trace is wrong if its relative difference from a call is above this: rounding is less
+MAX_TRACE_DIFFERENCE = 1e-10  # a trace is wrong if its relative error exceeds this: rounding errors are smaller
 
 # cost of operations by kind, in multiplications; the cost of other operations is not counted
 COSTS = {op.PRODUCT: 1, op.RECIPROCAL: 4}
@@ -96,7 +96,7 @@ class Program:
         return algebra.run_program(self)
 
     def quantities(self, available: Container[int] = ()) -> list[int]:
-        """Return the indices of the quantities to compute for arrays and conditions, except `available` quantities."""
+        """Return the indices of the quantities that the program must compute, except those in `available`."""
         return self.graph.quantities_for(self.expressions, available)
 
     def cost(self) -> int:
@@ -202,7 +202,7 @@ class OperationTable(NamedTuple):
         )
 
     def as_floats(self) -> list[float]:
-        """Return the table as floats, to be stored among the parameters of a model; results become nodes 0, 1, ..."""
+        """Return the table as floats, for the parameters of a model; the results become the first nodes."""
         rows = self.rows.copy()
         is_result = rows[:, KIND] == RESULT
         n_results = int(is_result.sum())
@@ -212,7 +212,7 @@ class OperationTable(NamedTuple):
         return [float(x) for part in parts for x in part]
 
     def as_arrays(self, result_indices: Sequence[int]) -> tuple[Any, Any]:
-        """Return the table as integers and floats; `result_indices`: where the derived callback stores results."""
+        """Return the table as integers and floats; `result_indices`: indices of results in a callback's array."""
         rows, n = self.rows.copy(), len(result_indices)
         rows[rows[:, KIND] == RESULT, NODE] += self.n_nodes
         header = [self.n_nodes + n, len(rows), len(self.columns), n]
@@ -278,7 +278,7 @@ class Coefficients:
 
     @property
     def formulas(self) -> Any:
-        """Return the coefficients as floats or Parameters; the array object changes only if a coefficient is added."""
+        """Return an array of the coefficients (floats or Parameters); it stays the same object until one is added."""
         if len(self._formulas) != len(self._values):
             self._formulas = number_array(self._values)
         return self._formulas

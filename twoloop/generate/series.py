@@ -33,13 +33,13 @@ USED_CALLBACKS = ("mass", "force", "jacobian", "nonholonomic", "constraint_rate"
 
 
 class Sums(NamedTuple):
-    """List of affine expressions (a constant, and terms "coefficient times quantity") as arrays."""
+    """List of affine expressions as arrays: constants, first terms "coefficient times quantity", and further terms."""
 
     column: Integers  # for each expression, the index of the quantity in its first term
     coefficient: Array  # for each expression, the coefficient of its first term
     constant: Array  # for each expression, its constant
-    row: Integers  # for each further term, the index of its expression; in `SeriesProgram.rows`, of its equation
-    further_column: Integers  # for each further term (not the first one of an expression), the index of its quantity
+    row: Integers  # for each further term, the index of its expression; in `rows` and `balance`, of the equation
+    further_column: Integers  # for each further term, the index of its quantity
     further_coefficient: Array  # for each further term, its coefficient
 
 
@@ -47,10 +47,10 @@ class Sums(NamedTuple):
 class OperationGroups:
     """Operations in groups, in the order of their computation; their results are consecutive quantities.
 
-    groups : array with a row for each group. A group has operations of one kind, such as SINE, that do not need the
-        results of each other. A row contains this kind, then begin and end of three ranges: of the operations, of their
-        terms in the further_... arrays of `first`, and of those in `second`. Sines and the cosines of the same angles
-        are one group. The last group has the products of M, G with a, lam, v, the unknowns in each order of the series.
+    groups : array with a row for each group: the kind of its operations; begin and end of the operations; begin and end
+        of their entries in the further_... arrays of `first`, then in those of `second`. A group has operations of one
+        kind, such as SINE, that do not need the results of each other. Sines and cosines of the same angles form one
+        group. The last group contains products with quantities that each order solves for: v, lam and a.
     first, second : first and second argument of each operation.
     """
 
@@ -65,9 +65,9 @@ class SeriesProgram:
 
     early : operations that depend on t and q only; after them, the products in G v.
     late : operations that depend on v, too; after them, the products in G^T lam + M a.
-    rows, row_indices : nonzero rows of G v + (C_t, b), without terms "constant times v_i"; their indices.
-    balance, balance_indices : likewise Q - G^T lam - M a, without terms "constant times lam_i" or "constant times a_i".
-    traced : traces of the callbacks, to be compared with calls; None: no comparison.
+    rows, row_indices : nonzero rows of G v + (C_t, b), and their indices. Terms "constant times v_i" are left out.
+    balance, balance_indices : likewise for Q - G^T lam - M a; terms with "constant times" lam_i or a_i are left out.
+    traced : traces of the callbacks, for a comparison with calls; None: nothing is compared.
     """
 
     n_q: int
@@ -194,11 +194,11 @@ def _sum_of_products(
     products: dict[Any, Any],
     of_rates: bool,
 ) -> Affine:
-    """Return rest + sum_i factors[i] multipliers[i], with few products; new products are added to the dict `products`.
+    """Return rest + sum_i factors[i] multipliers[i]; add products that this sum needs to the dict `products`.
 
     There are two ways: (1) terms with equal factors share a product; (2) each factor is split into its quantities, and
-    terms with the same quantity share a product. The way with fewer new products is taken. If both need as many, (2)
-    is taken if `of_rates` (for G v + (C_t, b)), else (1): (2) may yield (cos x) x', the rate of sin x, at no cost.
+    terms with the same quantity share a product. The way that adds fewer products is taken. If both add equally many,
+    way (2) is taken for G v + (C_t, b) (`of_rates`), where (cos x) x' costs nothing beside sin x; otherwise way (1).
     """
     total = rest
     by_factor: dict[Any, tuple[Affine, Affine]] = {}
@@ -267,19 +267,19 @@ def _assemble_program(
         ]
         for operations, products in ((early, row_products), (late, reaction_products))
     ]
-    nodes = {i: k for k, i in enumerate(inputs)}
+    places = {i: k for k, i in enumerate(inputs)}
     for groups in tables:
         for _, members in groups:
             for quantity, *_ in members:
-                nodes[quantity] = len(nodes)
+                places[quantity] = len(places)
     v_and_a, lam_and_a = set(inputs[1 + n : 1 + 3 * n]), set(inputs[1 + 2 * n :])
     return SeriesProgram(
         n,
         n_rows,
-        _make_groups(tables[0], nodes),
-        _make_groups(tables[1], nodes),
-        *_nonzero_sums([_remove_terms(expr, v_and_a) for expr in rows], nodes),
-        *_nonzero_sums([_remove_terms(expr, lam_and_a) for expr in balance], nodes),
+        _make_groups(tables[0], places),
+        _make_groups(tables[1], places),
+        *_nonzero_sums([_remove_terms(expr, v_and_a) for expr in rows], places),
+        *_nonzero_sums([_remove_terms(expr, lam_and_a) for expr in balance], places),
     )
 
 
@@ -295,10 +295,10 @@ def _needed_operations(graph: Graph, exprs: list[Affine]) -> list[tuple[int, Any
     ]
 
 
-def _nonzero_sums(exprs: list[Affine], nodes: dict[int, int]) -> tuple[Sums, Integers]:
-    """Return the nonzero expressions as Sums, whose `row` is an index in `exprs`, and their indices in `exprs`."""
+def _nonzero_sums(exprs: list[Affine], places: dict[int, int]) -> tuple[Sums, Integers]:
+    """Return the nonzero expressions as Sums, and their indices in `exprs`; `row` in the Sums contains such indices."""
     indices = [k for k, expr in enumerate(exprs) if expr.terms or expr.constant]
-    sums = _convert_to_sums([exprs[k] for k in indices], nodes)
+    sums = _convert_to_sums([exprs[k] for k in indices], places)
     index_array = np.array(indices, dtype=np.int64)
     return sums._replace(row=index_array[sums.row]), index_array
 
@@ -308,23 +308,23 @@ def _remove_terms(expr: Affine, inputs: Container[int]) -> Affine:
 
 
 def _grouped_operations(operations: list[Any]) -> list[tuple[int, list[Any]]]:
-    """Sort operations into groups of one kind; a group depends on earlier groups only. Return (kind, operations)."""
-    nodes = {node for node, *_ in operations}
+    """Return groups (kind, operations of this kind); the operations of a group depend on earlier groups only."""
+    quantities = {quantity for quantity, *_ in operations}
     levels: dict[int, int] = {}
     groups: dict[tuple[int, int], list[Any]] = {}
-    for node, kind, first, second in operations:  # an operation comes after those that compute its arguments
-        arguments = [i for expr in (first, second) if expr is not None for i in expr.terms if i in nodes]
-        levels[node] = 1 + max((levels[i] for i in arguments), default=0)
+    for quantity, kind, first, second in operations:  # an operation comes after those that compute its arguments
+        arguments = [i for expr in (first, second) if expr is not None for i in expr.terms if i in quantities]
+        levels[quantity] = 1 + max((levels[i] for i in arguments), default=0)
         if second is None:
             second = Affine(first.graph, 0.0, {})
-        groups.setdefault((levels[node], kind), []).append((node, first, second))
+        groups.setdefault((levels[quantity], kind), []).append((quantity, first, second))
     ordered = []
     for (depth, kind), members in sorted(groups.items()):
         if kind == COSINE:
             continue
         members.sort(key=_term_counts)  # operations with equal numbers of terms become neighbours
         if kind == SINE:
-            cosines = {first.key: node for node, first, _ in groups[depth, COSINE]}
+            cosines = {first.key: quantity for quantity, first, _ in groups[depth, COSINE]}
             members += [(cosines[first.key], first, second) for _, first, second in members]
         ordered.append((kind, members))
     return ordered
@@ -335,10 +335,10 @@ def _term_counts(operation: tuple[int, Affine, Affine]) -> tuple[int, int]:
     return len(first.terms), len(second.terms)
 
 
-def _make_groups(groups: list[tuple[int, list[Any]]], nodes: dict[int, int]) -> OperationGroups:
-    """Convert groups (kind, operations) to OperationGroups; `nodes`: index, in the program, of each quantity."""
+def _make_groups(groups: list[tuple[int, list[Any]]], places: dict[int, int]) -> OperationGroups:
+    """Convert groups (kind, operations) to OperationGroups; `places`: {quantity of the graph: index in the program}."""
     members = [member for _, group in groups for member in group]
-    sums = [_convert_to_sums([member[k] for member in members], nodes) for k in (1, 2)]
+    sums = [_convert_to_sums([member[k] for member in members], places) for k in (1, 2)]
     rows, begin = [], 0
     for kind, group in groups:
         end = begin + len(group)
@@ -348,9 +348,9 @@ def _make_groups(groups: list[tuple[int, list[Any]]], nodes: dict[int, int]) -> 
     return OperationGroups(np.array(rows, dtype=np.int64), *sums)
 
 
-def _convert_to_sums(exprs: list[Affine], nodes: dict[int, int]) -> Sums:
-    """Convert a list of expressions to Sums; `nodes`: index, in the program, of each quantity of the graph."""
-    terms = [[(nodes[i], c) for i, c in expr.terms.items()] or [(0, 0.0)] for expr in exprs]
+def _convert_to_sums(exprs: list[Affine], places: dict[int, int]) -> Sums:
+    """Convert a list of expressions to Sums; `places`: {quantity of the graph: index in the program}."""
+    terms = [[(places[i], c) for i, c in expr.terms.items()] or [(0, 0.0)] for expr in exprs]
     further_terms = [(k, *term) for k, form_terms in enumerate(terms) for term in form_terms[1:]]
     return Sums(
         np.array([form_terms[0][0] for form_terms in terms], dtype=np.int64),

@@ -30,7 +30,7 @@ from twoloop.problem.system import ConstrainedSystem
 TIME_CALLBACKS = ("force", "constraint_rate", "nonholonomic_rate")  # callbacks whose dependence on time is analysed
 # callbacks whose dependence on q and v is analysed
 STATE_CALLBACKS = ("force", "mass", "constraint", "jacobian", "nonholonomic")
-SMOOTH_OPERATIONS = (PRODUCT, SUM, SINE, COSINE)  # functions of time by other operations may have short pulses
+SMOOTH_OPERATIONS = (PRODUCT, SUM, SINE, COSINE)  # a function of time with another operation may have short pulses
 MAX_DEGREE = 8  # polynomials in time, or in sines and cosines, of a higher degree may have short pulses
 MAX_DEGREE_OF_STATE = 32  # polynomials in q and v of a higher degree, and their roots, may have short pulses
 MAX_DEGREE_OF_DIVISOR = 4  # a quotient may have short pulses if its divisors have a higher total degree in q and v
@@ -137,7 +137,7 @@ class DegreeAlgebra(Algebra[float]):
 
 
 class TrigonometricDegrees(DegreeAlgebra):
-    """Algebra whose values are degrees as polynomials in sines, cosines: high powers of a sine have short pulses."""
+    """Algebra whose values are degrees of polynomials in sines and cosines: a high power of a sine has short pulses."""
 
     functions = MappingProxyType(
         {**DegreeAlgebra.functions, **dict.fromkeys((SINE, COSINE), lambda degree: max(degree, 1.0))}
@@ -153,9 +153,9 @@ class GrowthExponents(DegreeAlgebra):
 
 
 class DivisorDegrees(DegreeAlgebra):
-    """Algebra whose values are total degrees of a quantity's divisors: a sum over factors, a maximum over terms.
+    """Algebra whose values are total degrees of divisors: a product adds the degrees, a sum takes the largest one.
 
-    `degrees`: degrees of all quantities. Arguments of arctangents count as divisors: their derivatives are quotients.
+    `degrees`: degrees of all quantities. Arctangents of x count as divisions by x: their derivative is x' / (1 + x^2).
     """
 
     def __init__(self, degrees: DegreeAlgebra):

@@ -1,8 +1,8 @@
 """Trace callbacks: run them in Python on symbols; functions of `math` and `numpy` are replaced by symbolic ones.
 
 A callback must do with symbols exactly what it does with numbers. So a function that may treat symbols differently
-raises an exception if it is called with a symbol; the message names the function. A callback that catches this
-exception is not traced, either. Differences that tracing cannot detect, such as a changed global variable, are found by
+raises an exception if it is called with a symbol; the message names the function. The callback is not traced then, even
+if it catches the exception. Differences that tracing cannot detect, such as a changed global variable, are found by
 comparing numbers (`traced_values.py`).
 
 `Equations` returns the result of every callback of one system as an array of expressions. Without a callback for C_q or
@@ -72,7 +72,7 @@ def trace(function: Callable[..., Any], t: Affine, *arguments: Any) -> Any:
             value = _CallbackCopier(lambda copy, _: copy).callback(function)(t, *arguments)
         except (Refusal, Untraceable) as refusal:
             raise Untraceable(f"{graph.refusal_reason or refusal}{source_location(refusal)}") from None
-        except Exception as error:  # a callback may raise anything on symbols
+        except Exception as error:  # with symbols, a callback may raise any exception
             if not graph.refusal_reason:
                 text = str(error).partition("\n")[0].replace("twoloop.generate.graph.", "").replace("Affine", "symbol")
                 text = f"it does not run on symbols in the place of t, q and v: {type(error).__name__}: {text}"
@@ -101,7 +101,7 @@ class _CallbackCopier(FunctionCopier):
         return isinstance(value, Dispatcher | types.FunctionType)
 
     def callback(self, function: Any) -> Any:
-        """Return a copy, for a trace, of a callback: of a function, or of an object with a method `__call__`."""
+        """Return a copy of a callback for a trace; a callback is a function, or an object with a method `__call__`."""
         method = next((vars(each)["__call__"] for each in type(function).__mro__ if "__call__" in vars(each)), None)
         if isinstance(method, types.FunctionType) and not isinstance(function, Dispatcher):
             return types.MethodType(self.replacement_of(method), function)
@@ -158,7 +158,7 @@ def _refuse_symbols(value: Any, verb: str) -> None:
 
 
 def _numeric_function(function_of_numbers: Any, name: str) -> Callable[..., Any]:
-    """Return a function that refuses symbols, and calls `function_of_numbers` otherwise; `name`: for the message."""
+    """Return a function that calls `function_of_numbers`; with symbols, it raises an exception that contains `name`."""
 
     @functools.wraps(function_of_numbers)
     def call_with_numbers(*arguments: Any, **options: Any) -> Any:
@@ -169,7 +169,7 @@ def _numeric_function(function_of_numbers: Any, name: str) -> Callable[..., Any]
 
 
 def _number_or_symbol(numeric: Any, symbolic: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a function that calls `symbolic` for symbols and entries of arrays of symbols, `numeric` for numbers."""
+    """Return a function that calls `numeric` with numbers and `symbolic` with symbols, also those in an array."""
 
     def call_matching(*arguments: Any) -> Any:
         if _first_symbol(arguments) is None:
@@ -265,7 +265,7 @@ TRACING_ORDER = (
     *("constraint", "constraint_rate", "jacobian", "nonholonomic", "nonholonomic_rate", "mass", "force"),
     *("gamma", "nonholonomic_gamma"),
 )
-# keys: callbacks for gamma; values: callbacks from whose derivatives gamma also follows (C_q and C_t, or A and b)
+# keys: callbacks for gamma. Values: the two callbacks (C_q and C_t, or A and b) whose derivatives yield gamma, too
 GAMMA_SOURCES = {"gamma": ("jacobian", "constraint_rate"), "nonholonomic_gamma": ("nonholonomic", "nonholonomic_rate")}
 
 
@@ -386,7 +386,7 @@ class Equations:
 
 
 def runs_on_symbols(system: ConstrainedSystem, kind: str, parameters: Any) -> bool:
-    """Return whether a compiled callback can be traced with `parameters`, some of which are Parameters."""
+    """Return whether a compiled callback can be traced with `parameters`, which are numbers or Parameters."""
     equations = Equations(system, parameters)
     state = {"q": equations.q, "v": equations.v, "lam": equations.graph.inputs(system.n_c, True)}
     arrays = [symbol_array(state[name]) for name in KINDS[kind].state]
@@ -412,7 +412,7 @@ Array = NDArray[np.float64]
 ScaledProducts = tuple[Array, NDArray[np.int64], list[Powers]]
 Evaluator = Callable[[Any], Array]  # function that evaluates arrays of expressions for the parameters of one system
 
-# range of the random numbers that replace parameters in traces; all of similar size, so that rounding hides no term
+# random numbers in this range replace parameters in traces: they are of similar size, so that rounding hides no term
 GENERIC_RANGE = 0.5, 1.5
 # a parameter is a constant in traces if its magnitude is below this value, or above the inverse: powers of such
 # parameters might underflow or overflow
@@ -453,7 +453,7 @@ class TraceCache:
 
     def equations(self, system: ConstrainedSystem) -> Equations:
         """Return the traced callbacks of a system, with their own copy of the graph, which the caller may extend."""
-        if system.called_in_python:  # trace a callback only when needed: Python functions may store the symbols
+        if system.called_in_python:  # trace a callback only when needed: a Python function may store symbols
             return Equations(system, self.parameters)
         traced: Equations = self.remembered("equations", lambda: Equations(system, self.parameters).trace_all())
         return traced.copy()
@@ -463,7 +463,7 @@ class TraceCache:
         return np.abs(parameters[self._first_of_class])
 
     def product_evaluator(self, parameters: Array) -> Callable[[Powers], Any]:
-        """Return a function that evaluates Powers (products of powers of atoms) for the `parameters` of one system."""
+        """Return a function that evaluates products of powers (type `Powers`) for the `parameters` of one system."""
         return self._tape.product_evaluator(self.magnitudes(parameters))
 
     def evaluator(self, parameters: Array) -> Evaluator:
@@ -507,7 +507,7 @@ class TraceCache:
 def derive_cached(
     system: ConstrainedSystem, key: Any, make: Callable[[TraceCache], Any], check: Callable[[Any], None]
 ) -> Any:
-    """Return what `make` derives from traces, for example a program, with the coefficients of one system.
+    """Return what `make` derives from traces, such as a program, after inserting the parameters of one system.
 
     `make` gets a TraceCache, and returns an object with a method `specialize`, which inserts the parameters of the
     system. Results are cached by `key`. `check` raises Untraceable if a result does not agree with the callbacks.
@@ -530,7 +530,7 @@ def derive_cached(
 
 
 def _derive_shared(system: ConstrainedSystem, cache: TraceCache, key: Any, make: Callable[[TraceCache], Any]) -> Any:
-    """Return the result of make(cache) with the coefficients of `system`; if this fails, return an Untraceable."""
+    """Return the result of make(cache) for the parameters of `system`; on failure, return the exception Untraceable."""
     try:
         result = cache.remembered(key, partial(make, cache))
         return result.specialize(
@@ -561,7 +561,7 @@ def shared_cache(system: ConstrainedSystem) -> TraceCache:
 
 
 def trace_cache_of(system: ConstrainedSystem) -> TraceCache:
-    """Return the TraceCache of all systems with the same compiled callbacks, sizes and classes (see TraceCache)."""
+    """Return the TraceCache of all systems with equal compiled callbacks, sizes, parameter classes and constants."""
     parameters = system.parameters
     classes = _parameter_classes(parameters)
     fixed_parameters = parameters[classes == 0] + 0.0  # -0.0 becomes 0.0, so that keys with zeros are equal
@@ -578,7 +578,7 @@ def _own_cache(system: ConstrainedSystem) -> TraceCache:
 
 
 def _parameter_classes(parameters: Array) -> NDArray[np.int64]:
-    """Return the class of each parameter, see `TraceCache`; numbers of classes follow the order of `parameters`."""
+    """Return the class (see TraceCache) of each parameter: 0 for constants; equal magnitudes have the same number."""
     magnitudes = np.abs(parameters)
     varies = (magnitudes > MIN_MAGNITUDE) & (magnitudes < 1.0 / MIN_MAGNITUDE) & (magnitudes != np.floor(magnitudes))
     _, first, inverse = np.unique(magnitudes[varies], return_index=True, return_inverse=True)
@@ -593,9 +593,9 @@ class ParameterArrays:
     """Arrays of numbers that stand for arrays of expressions; `write` overwrites them by values for new parameters."""
 
     def __init__(self) -> None:
-        # values: an array of expressions, stored so that its id stays unique, and its array of numbers; keys: this id
+        # keys: id of an array of expressions. Values: this array, stored so that no other gets its id, and its numbers
         self._arrays: dict[int, tuple[Any, Array]] = {}
-        # for each array: its numbers as a flat array, indices of entries that vary, their range in `values` of `write`
+        # for each array: its numbers (flat); indices of varying entries; slice of `values` in `write` for these entries
         self._number_arrays: list[tuple[Array, NDArray[np.int64], slice]] = []
         self._products: dict[Powers, int] = {}
         self._scales: list[float] = []
@@ -603,7 +603,7 @@ class ParameterArrays:
         self._gathered_products: tuple[list[Powers], Array, NDArray[np.int64]] | None = None
 
     def array(self, exprs: Any) -> Array:
-        """Return the array of numbers for `exprs`, the same in all calls; `exprs` itself if it has numbers only."""
+        """Return the array of numbers that always stands for `exprs`; return `exprs` if it contains only numbers."""
         if exprs.dtype != object:
             return exprs  # type: ignore[no-any-return]
         if id(exprs) not in self._arrays:
@@ -611,7 +611,7 @@ class ParameterArrays:
         return self._arrays[id(exprs)][1]
 
     def _numbers_for(self, exprs: Any) -> Array:
-        """Return a new array of numbers for `exprs`: constants, and 0 for Parameters, whose values `write` adds."""
+        """Return a new array with the constants of `exprs`, and 0 for each Parameter until `write` stores its value."""
         entries, begin = exprs.ravel().tolist(), len(self._scales)
         varying = [k for k, entry in enumerate(entries) if type(entry) is Parameter]
         for k in varying:
@@ -628,7 +628,7 @@ class ParameterArrays:
         return numbers.reshape(exprs.shape)
 
     def write(self, product: Callable[[Powers], Any]) -> None:
-        """Write the values of all expressions to the arrays; `product`: function from `product_evaluator`."""
+        """Store the values of all expressions in the arrays; `product`: result of TraceCache.product_evaluator."""
         if self._gathered_products is None:
             return
         products, scales, product_indices = self._gathered_products

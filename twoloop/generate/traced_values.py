@@ -33,16 +33,16 @@ N_NEARBY = 8  # before a run, calls and traces are compared at the start, and at
 RELATIVE_TIMES = np.linspace(0.0, 1.0, N_NEARBY)  # times of the random states, from 0 (start of the run) to 1 (its end)
 NEARBY_DISTANCE = 0.3  # largest distance of a random position from the start, relative to the sizes of the coordinates
 MAX_STATES_OF_CHUNK = 32  # a `Sample` takes at most about this number of states from one chunk of steps
-MAX_STATES = 64  # about the largest number of states at which traces are compared; largest number of chunks in `Sample`
-MAX_STATES_IN_PYTHON = 9  # the same as MAX_STATES, for comparisons with callbacks that are called in Python
-MAX_ENTRIES = 20_000  # about the largest number of entries that are compared: for large systems, fewer states suffice
-# differences of call and trace are compared with the largest term that the trace adds up in any entry of the result
-ROUNDING_DIFFERENCE = 16.0 * np.finfo(float).eps  # a difference up to this * the largest term is a rounding error
-CLEAR_DIFFERENCE = 1e-6  # the trace is wrong if a difference is above this * the largest term, or is systematic
+MAX_STATES = 64  # a comparison uses at most about this number of states, a `Sample` at most this number of chunks
+MAX_STATES_IN_PYTHON = 9  # replaces MAX_STATES if the callbacks are called in Python
+MAX_ENTRIES = 20_000  # fewer states are compared in large systems: (states) * (results per state) is about this at most
+# the scale of rounding errors of a callback: the largest bound of its rounding errors, divided by EPS (see checks.py)
+ROUNDING_DIFFERENCE = 16.0 * np.finfo(float).eps  # differences up to this * (scale of rounding errors) are harmless
+CLEAR_DIFFERENCE = 1e-6  # a trace is wrong if a difference exceeds this * (scale of rounding errors), or is systematic
 # `_is_systematic` compares call and trace at N_NEIGHBOURS states, at most PERTURBATION (relative) from a given state
 PERTURBATION, N_NEIGHBOURS = 1e-7, 12
 MARGIN = 0.01  # a CheckedRegion extends the range of each entry of checked states [t, q, v] by this * (max - min)
-MARGIN_AT_REST = 1e-9  # ranges of checked states are also extended by this * the largest range: ranges at rest are 0
+MARGIN_AT_REST = 1e-9  # each range also grows by this * (largest range of q and v), as coordinates at rest have range 0
 
 
 class CallbackTraces:
@@ -51,7 +51,7 @@ class CallbackTraces:
     graph : the graph of the trace, whose first inputs are t, q and v.
     exprs : traced results to compare, as arrays of expressions; keys: names of callbacks, such as "mass". None: all
         results in `graph.traced` for which the system has a callback.
-    is_trusted (field) : whether calls and traces agreed near a start; then later runs skip this comparison.
+    is_trusted (field) : True if calls and traces agreed near a start; later runs then skip this comparison.
     """
 
     def __init__(self, system: ConstrainedSystem, graph: Graph, exprs: Mapping[str, Any] | None = None):
@@ -78,7 +78,7 @@ class CallbackTraces:
         return traced
 
     def replace_coefficients(self, convert: Callable[[Any], Array]) -> "CallbackTraces":
-        """Return a copy, not trusted yet, in which convert(array) replaces each array of coefficients."""
+        """Return a copy, with `is_trusted` = False, in which convert(array) replaces each array of coefficients."""
         traced = copy.copy(self)
         traced.program = self.program.replace_coefficients(convert)
         traced.is_trusted = False
@@ -89,9 +89,9 @@ class CallbackTraces:
         refuse_wrong_traces([self], system, t0, t1, q, v)
 
     def check_near_start(self, system: ConstrainedSystem, nearby: Array) -> None:
-        """Compare calls and traces at the states `nearby`; raise Untraceable if they differ, else trust the traces."""
+        """Compare calls and traces at states `nearby`; raise Untraceable if they differ, else update `is_trusted`."""
         difference = None
-        for states in (nearby, *nearby[:, None, :]):  # all states at once; then, only if a call raises, one by one
+        for states in (nearby, *nearby[:, None, :]):  # take all states at once; if a call raises, one by one
             try:
                 difference = difference or self.difference(system, states, everywhere=False)
             except Exception:  # a callback is not defined at one of these states
@@ -105,7 +105,7 @@ class CallbackTraces:
     def difference(self, system: ConstrainedSystem, states: Array, everywhere: bool = True) -> str | None:
         """Return a message about the first difference of calls and traces at states [t, q, v], or None if they agree.
 
-        If `everywhere`, the trace must not be finite where a call returns NaN or inf; else such values are ignored.
+        If `everywhere`, the trace must not be finite where a call returns NaN or inf; otherwise ignore such values.
         """
         from twoloop.kernels.evaluation import checks as kernels
 
@@ -124,10 +124,10 @@ class CallbackTraces:
         else:
             is_agreeing |= ~finite
         largest = np.where(np.isfinite(bounds), bounds, 0.0).max(axis=0)
-        # for each entry, the largest term in any entry of its callback: the scale of rounding errors
-        max_term = np.repeat(np.maximum.reduceat(largest, np.cumsum(self.n_entries) - self.n_entries), self.n_entries)
-        for k, entry in np.argwhere(~is_agreeing & ~(differences <= ROUNDING_DIFFERENCE * max_term)):
-            if not differences[k, entry] <= CLEAR_DIFFERENCE * max_term[entry] or self._is_systematic(
+        # for each entry, the scale of rounding errors of its callback is the largest bound of the callback's entries
+        scales = np.repeat(np.maximum.reduceat(largest, np.cumsum(self.n_entries) - self.n_entries), self.n_entries)
+        for k, entry in np.argwhere(~is_agreeing & ~(differences <= ROUNDING_DIFFERENCE * scales)):
+            if not differences[k, entry] <= CLEAR_DIFFERENCE * scales[entry] or self._is_systematic(
                 system, states[k], int(entry)
             ):
                 return self._message(states[k], int(entry), called[k, entry], traced[k, entry])
@@ -151,7 +151,7 @@ class CallbackTraces:
         return n_different, called, traced, bounds
 
     def _is_systematic(self, system: ConstrainedSystem, state: Array, entry: int) -> bool:
-        """Return True if call - trace has the same sign and a similar size at nearby states; rounding errors vary."""
+        """Return True if errors of a traced `entry` have one sign and similar sizes near `state`, unlike rounding."""
         directions = np.random.default_rng(5).uniform(-1.0, 1.0, (N_NEIGHBOURS, len(state)))
         _, called, traced, _ = self._evaluate(system.kit, state * (1.0 + PERTURBATION * directions))
         errors = (called - traced)[:, entry]
@@ -169,14 +169,14 @@ class CallbackTraces:
 
 
 class Sample:
-    """States [t, q, v] of a run, or every k-th, for the comparison after the run; `n`: length of [q, v]."""
+    """States [t, q, v] of a run, not always all, for the comparison after the run; `n`: length of [q, v]."""
 
     def __init__(self, t: float, state: Array, n: int) -> None:
         self._n, self._chunks = n, list[Array]()
         self.add(state[:0], state[None, :][:0], t, state)
 
     def add(self, t: Array, rows: Array, end: float, state: Array) -> None:
-        """Add states of successive steps: `rows` [q, v, ...] at times `t` (if many, every k-th), `state` at `end`."""
+        """Add states [q, v, ...]: `rows` at times `t` (only some of them if there are many), and `state` at `end`."""
         stride = 1 + len(t) // MAX_STATES_OF_CHUNK
         times = t[::stride]
         states = np.empty((len(times) + 1, 1 + self._n))
@@ -200,7 +200,7 @@ class Sample:
 def refuse_wrong_traces(
     traced: Sequence[CallbackTraces], system: ConstrainedSystem, t0: float, t1: float, q: Array, v: Array
 ) -> None:
-    """Compare traces that are not trusted yet with calls, near the start; raise Untraceable if a trace is wrong."""
+    """Compare traces that are not `is_trusted` with calls near the start; raise Untraceable if a trace is wrong."""
     untrusted = [trace for trace in traced if not trace.is_trusted]
     if not untrusted:
         return
@@ -215,7 +215,7 @@ Check = Callable[[CallbackTraces], None]  # function that compares traces with c
 
 
 def accept_traces(traced: CallbackTraces) -> None:
-    """Do not compare traces: this `Check` is for results from which no motion is computed, such as a cost."""
+    """Accept traces without a comparison: the `Check` for results that yield no motion, or that are compared later."""
 
 
 def states_near_start(t0: float, t1: float, q: Array, v: Array) -> Array:
@@ -233,7 +233,7 @@ def states_near_start(t0: float, t1: float, q: Array, v: Array) -> Array:
 
 @cache
 def _random_directions(n_q: int) -> Array:
-    """Return random numbers between -1 and 1, shape (2: for q and v, N_NEARBY, n_q), the same in every call."""
+    """Return random numbers between -1 and 1, the same in every call: for q, then for v, an array (N_NEARBY, n_q)."""
     return np.random.default_rng(6).uniform(-1.0, 1.0, (2, N_NEARBY, n_q))
 
 
@@ -272,7 +272,7 @@ class CheckedRegion:
         return states[outside.any(axis=1)] if outside.any() else states[:0]
 
     def contains_parameters(self, parameters: Array) -> bool:
-        """Return whether all parameters are within the checked ranges, extended by the fraction MARGIN."""
+        """Return whether all parameters are within the ranges of earlier runs, extended by the fraction MARGIN."""
         if self._parameters is None:
             return False
         smallest, largest = self._parameters

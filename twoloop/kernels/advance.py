@@ -61,7 +61,7 @@ from twoloop.kernels.linalg.dense import copy
 
 SUDDEN_ERROR = 10.0  # a force is assumed to jump within a rejected step whose error, in tolerances, exceeds this
 MAX_RATIO_AFTER_REJECTION = 0.95  # the next step size is at most this times the size of a rejected step
-FIRST_JUDGED_STEP = 2  # in a trial of a method, sizes of steps count from this accepted step on: the first is a guess
+FIRST_JUDGED_STEP = 2  # a trial judges a method by step sizes from this accepted step on: the first size is a guess
 
 
 @kernel(i8(KIT, WORK, f8, VECTOR))
@@ -77,7 +77,7 @@ def start(f, w, t, state):
         code = find_tangents(f, w, t, q)
     if code == DONE:
         code = accelerations(f, w, t, q, v, state[2 * n : 3 * n], state[3 * n :])
-    # finite differences yield Gamma with an error relative to its size, which is known only now: compute it again
+    # the allowed error of Gamma by finite differences depends on the size of Gamma, now known: compute Gamma again
     if code == DONE and f.gamma_given == 0:
         code = accelerations(f, w, t, q, v, state[2 * n : 3 * n], state[3 * n :])
     return code
@@ -85,7 +85,7 @@ def start(f, w, t, state):
 
 @merged
 def _locate_rate_jump(f, w, t, size, tolerances, accepted, state, new_state):
-    """Return SMOOTH, RAMP (steep) or JUMP, for C_t and b in a step, and two times (s): ends of the ramp or jump."""
+    """Return how C_t and b change in a step (SMOOTH, RAMP or JUMP), and when (s) a ramp or jump begins and ends."""
     n = w.Q.size
     q, v = state[:n], state[n : 2 * n]
     if not accepted:
@@ -101,7 +101,7 @@ def _locate_rate_jump(f, w, t, size, tolerances, accepted, state, new_state):
 def _attempt_step(f, w, options, memory, tolerances, control, clock, t, size, crosses_jump, state, new_state):
     """Attempt a step; return a code (DONE: no failure), the error in tolerances, and next size / `size` (0: unknown).
 
-    If `crosses_jump`, do not compute: `new_state` already contains the state after a jump of C_t or b.
+    If `crosses_jump`, no step is computed: `new_state` already contains the state after a jump of C_t or b.
     """
     w.orientation_new = 0.0
     if clock[at.FAILURE_CODE] == DONE:
@@ -143,7 +143,7 @@ def _must_repeat_at_jump(f, w, tolerances, control, clock, t, size, accepted, st
 
 @merged
 def _handle_failure(f, w, control, clock, t, size, code, t_repeated, state):
-    """Prepare the repetition of a step that failed with `code`, and return CONTINUE; else return an end code.
+    """Prepare to repeat a step that failed with `code`; return CONTINUE, or an end code if it cannot be repeated.
 
     A step is repeated with a smaller size, a new partition, or both. A step of fixed size is repeated only once, with a
     new partition. `t_repeated`: time (s) from which a step of fixed size was last repeated.
@@ -220,8 +220,8 @@ def advance(
 ):
     """Integrate from clock[T] and `state` to the last time in `outputs`; return an end code, see loop_state.py.
 
-    - Update `clock` and `state` in place. `new_state` is scratch; but if clock[APPLIES_JUMP] is 1, the caller has
-      stored the state after a jump of C_t or b in it, and the first step ends there.
+    - Update `clock` and `state` in place. `new_state` is scratch; but if clock[APPLIES_JUMP] is 1, it contains the
+      state after a jump of C_t or b, and the first step crosses this jump.
     - Shorten steps so that they end at output times. A step size is the difference of two floating-point times, so that
       step sizes add up to the exact time.
     - Store times and states in out_t and out_state: after each accepted step if control[STORE_ALL] is 1, otherwise at
@@ -292,7 +292,7 @@ def advance(
         )
         if code == NOT_LOADED:
             return at.NEEDS_COMPILATION
-        if w.time_is_up == 1.0:  # the time limit has passed, perhaps within this attempt: discard it
+        if w.time_is_up == 1.0:  # the time limit has passed, perhaps within this attempt: discard the attempt
             f.commit(f, w, options, memory, tolerances, False)
             return at.PAUSED
         # near a jump of a force, the error estimate may be too small: multiply it by JUMP_RATIO up to the time JUMP_END
@@ -329,7 +329,7 @@ def advance(
         error *= error_factor
         if factor == 0.0:
             factor = step_size_ratio(control, clock, size, error)
-        elif error_factor > 1.0 and error > 0.0:  # limit `factor`, which the method computed without `error_factor`
+        elif error_factor > 1.0 and error > 0.0:  # the method ignored `error_factor`: `factor` may be too large
             factor = min(factor, max(control[FACTOR_MIN], control[SAFETY] * error ** -control[EXPONENT]))
         proposed_size = min(size * factor, clock[at.H_LIMIT])
         if not accepted and factor > 1.0:
@@ -366,7 +366,7 @@ def advance(
         clock[at.LIMIT_AGE] += 1.0
         if clock[at.LIMIT_AGE] > control[at.LIMIT_MEMORY]:
             clock[at.H_LIMIT] = control[at.LIMIT_START]
-            clock[at.FAILURE_CODE] = DONE  # forget the last failure: it no longer explains short steps
+            clock[at.FAILURE_CODE] = DONE  # forget the last failure: it is too old to explain short steps
         if at_output and _pass_output_time(f, w, clock, outputs, state):
             return at.ALL_OUTPUT_DONE
         if fixed_size and not at_output:

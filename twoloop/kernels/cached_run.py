@@ -1,12 +1,12 @@
 """Start a run and take its first steps in one compiled call, for runs with the same options as an earlier one.
 
 `start_and_advance` checks the start, takes steps with the setup of the earlier run, and stores all results in one
-array, which Python copies, and splits when a field of the result is read. Its parts are
+array. Python copies the array, and splits the copy when a field of the result is read. The parts of the array are
 
     unused | report: N_REPORT numbers, counters | times | steps | states | unused
 
-`advance` writes the states, which begin at a fixed index. The lengths of the other parts are known only afterwards:
-they are copied to the places before this index. Common arguments: `f`: kit; `w`: workspace; `b`: RUN_ARRAYS.
+`advance` writes the states, which begin at a fixed index. As the numbers of times and steps are known only afterwards,
+the report, times and steps are then copied to the places before this index. Argument `b`: RUN_ARRAYS.
 """
 
 import math
@@ -35,7 +35,7 @@ from twoloop.kernels.data.indices import DEFECT_GAP, GAP, MAX_GAP_RATIO, N_COUNT
 from twoloop.kernels.evaluation.checks import CONSISTENT, DEFINITE, INDEFINITE, WELL_FORMED
 from twoloop.kernels.linalg.dense import copy
 
-ROUNDING = 1e-15  # rounding error of a position, relative to its largest coordinate: smaller corrections do not count
+ROUNDING = 1e-15  # rounding error of a position, relative to max|q|; if corrections are smaller, C_q is kept
 
 
 @merged
@@ -44,7 +44,7 @@ def prepare_work(w, numbers, integers, pattern, q, accuracy, reuse):
 
     `numbers`, `integers`: arrays of `w` that keep data from step to step; set to zero here. `pattern`: 1 for entries of
     [C_q; A] that may be nonzero, else 0. `accuracy`: allowed relative error of gamma by finite differences. `reuse`:
-    after a correction of positions of at most this size, the inner loop does not evaluate C_q again.
+    if a correction of positions is at most this, the inner loop does not evaluate C_q again.
     """
     for k in range(numbers.size):
         numbers[k] = 0.0
@@ -72,10 +72,10 @@ def prepare_workspace(w, numbers, integers, pattern, q, accuracy, reuse):
 
 FIRST_STEP = 0.01  # first step size, relative to the shortest time scale of the initial motion, see _first_step_size
 MIN_FIRST_STEP = 1e4  # smallest first step size, in spacings of floating-point numbers at the start time
-MIN_GAP = 40.0  # least limit of the time between two evaluations, in spacings of floating-point numbers
+MIN_GAP = 40.0  # the allowed time between evaluations is at least this number of spacings of floating-point times
 SHORTEST_STEP = 1e-16  # a run fails if a step would be shorter than this fraction of the first step
-# if forces may change suddenly with q or v, steps that check their defect evaluate the equations this number of times
-# as often: DEFECT_GAP, the time (s) allowed between two evaluations, is this number of times shorter than GAP
+# if forces may change suddenly with q or v, the allowed time (s) between two evaluations of the equations is this many
+# times shorter in steps that check their defect (DEFECT_GAP) than in other steps (GAP)
 GAP_RATIO = 10
 
 
@@ -83,8 +83,8 @@ GAP_RATIO = 10
 def _first_step_size(state, n, t, span, smallest):
     """Return the first step size (s): FIRST_STEP times the shortest time scale of the motion from `state` [q, v, a].
 
-    The time scales are the duration `span` (s) of the run, the times in which q changes by the larger one of max|q| and
-    `smallest`, and the time in which v changes by max|v|. The step has at least MIN_FIRST_STEP spacings of times at t.
+    The time scales are the run's duration `span` (s), the times in which v or a changes q by max(max|q|, `smallest`),
+    and the time in which a changes v by max|v|. The step has at least MIN_FIRST_STEP spacings of times at t.
     """
     distance, speed, acceleration = smallest, 0.0, 0.0
     for j in range(n):
@@ -103,7 +103,7 @@ def _first_step_size(state, n, t, span, smallest):
 
 @exact
 def _set_step_limits(control, tolerances, t, t1, longest, within):
-    """Store limits: longest step; longest time between evaluations of the equations, and between samples of forces.
+    """Store the largest step size, and the longest times between evaluations of the equations and samples of forces.
 
     Evaluations are at most MAX_GAP_RATIO * (t1 - t) s apart, which also limits the step size. If the method adds
     evaluations within long steps (`within` is True), only `longest` (s) limits the step size.
@@ -125,7 +125,7 @@ def first_step_and_limits(control, tolerances, state, n, t, t1, smallest, longes
 
 @merged
 def _is_within_bounds(t, rows, bounds):
-    """Return True if, at all times t[k], each number of [t[k], rows[k]] is between those in bounds[0] and bounds[1]."""
+    """Return True if, for all k, each number of [t[k], rows[k]] is between its limits in bounds[0] and bounds[1]."""
     for k in range(t.size):
         if not bounds[0, 0] <= t[k] <= bounds[1, 0]:
             return False
@@ -137,7 +137,7 @@ def _is_within_bounds(t, rows, bounds):
 
 @kernel(types.void(MATRIX, INTEGERS, VECTOR, types.int64[:, ::1], types.boolean[::1]))
 def split_steps(steps, counts, h, changes, used_newton):
-    """Split the records of steps, `steps` (rows of out_steps, see loop_state.py), into arrays with an entry per step.
+    """Split `steps`, the records of steps (rows of out_steps, see loop_state.py), into arrays with one entry per step.
 
     `h` receives the step sizes (s), `used_newton` True for steps by Newton's method. The three rows of `changes` count
     events since the previous step: rejections by the error test, failed steps, and new partitions.
@@ -160,9 +160,9 @@ UNCHOSEN = -4  # returned code: no steps were taken; Python must check whether t
 NOTHING_CHECKED, STATE_CHECKED, CHOICES_CHECKED = 0, 1, 2
 
 # arrays of a run, which later runs with the same options reuse. Among them are
-# - `numbers`: one array with the parts clock, control, tolerances; `start_numbers`: `numbers` before a run
+# - `numbers`: one array with the parts clock, control, tolerances; `start_numbers`: values of `numbers` before a run
 # - `start_memory`: numbers that the method's `memory` contains before a run, at the indices `memory_places`
-# - `last_start`: t, t1, q and v of the last start; `start_rows`: indices of the independent constraint rows there
+# - `last_start`: a count (N_EQUAL), then t, t1, q, v of the last start; `start_rows`: indices of its independent rows
 # - `saved`, `saved_integers`: all data computed at a start; if more runs begin at this start, they restore these data
 RUN_ARRAYS = Reference(
     "RunArrays",
@@ -187,11 +187,11 @@ RUN_ARRAYS.add_function("start", i8(KIT, WORK, f8, VECTOR))
 RUN_ARRAYS.add_function("advance", i8(KIT, WORK, *(VECTOR,) * 9, MATRIX, MATRIX, INTEGERS))
 # indices in `constants`, the settings of runs; G are the constraint rows [C_q; A]
 (
-    ACCURACY,  # allowed relative error of gamma by finite differences: initial w.gamma_required
-    REUSE,  # after a smaller correction of positions, the inner loop keeps C_q: initial w.reuse
-    NEARLY_SINGULAR,  # initial w.nearly_singular: 1 if the method does not check within steps for singular positions
+    ACCURACY,  # initial w.gamma_required: allowed relative error of gamma, if finite differences yield it
+    REUSE,  # initial w.reuse: after a smaller correction of positions, the inner loop does not evaluate C_q again
+    NEARLY_SINGULAR,  # initial w.nearly_singular. 0: short steps trigger checks for singular positions; 1: they do not
     HAS_ALL_ENTRIES,  # 1: the array `kinds` shows all entries of G that may be nonzero; 0: search for them at the start
-    RANK_LIMIT,  # a row of G is redundant if less than this fraction of it is orthogonal to other rows
+    RANK_LIMIT,  # a row of G is redundant if its part orthogonal to previous rows is at most this fraction of its norm
     WEAK_LIMIT,  # M counts as singular if the ratio of its smallest to its largest eigenvalue is below this
     ADDED_SCALE,  # factor s: for a singular M, generated code uses M + s g^T g instead, where g are some rows of G
     CONTRADICTS,  # a start is refused if a residual of G a = gamma exceeds this times max(1, sum of |terms| in the row)
@@ -199,19 +199,19 @@ RUN_ARRAYS.add_function("advance", i8(KIT, WORK, *(VECTOR,) * 9, MATRIX, MATRIX,
     LEAST_PIVOT,  # a start is refused if the smallest pivot of C_q at the start is below this
     EQUATION_FORM,  # initial f.form, the algebra that solves for accelerations
     FIRST_SIZE,  # first step size (s) that the user has chosen; 0: it is computed
-    LEAST_DISTANCE,  # shortest displacement that determines a time scale: argument `smallest` of _first_step_size
+    LEAST_DISTANCE,  # argument `smallest` of _first_step_size, the displacement that replaces a smaller max|q|
     LONGEST,  # longest step (s): argument `longest` of _set_step_limits
-    EVALUATES_WITHIN,  # 1: the method adds evaluations within long steps; 0: long steps are forbidden
+    EVALUATES_WITHIN,  # 1: the method adds evaluations within long steps; 0: it does not, which limits the step size
     NEAR_PIVOT,  # Python must check a run if, at an output time, (smallest / largest pivot of C_q) is below this
-    MAX_CHANGE_RATIO,  # velocities jump in a step if they change by more than this times (step size) times |a|
-    MIN_SAMPLES,  # Python must check a run if a force, C_t or b changes suddenly twice in this many sample spacings
+    MAX_CHANGE_RATIO,  # velocities jump in a step if max|change| exceeds this * (step size) * max|a| at both ends
+    MIN_SAMPLES,  # Python must check a run if sudden changes of a force, C_t or b are less than this many samples apart
 ) = range(18)
 # indices in `expected`, the choice of constraint rows for which code was generated (empty without generated code)
 (
-    BOUND,  # index in MIN_PIVOTS (generate/elimination.py) of the pivot limit; OF_PYTHON: only Python can choose rows
+    BOUND,  # index of the pivot limit in MIN_PIVOTS (generate/elimination.py); OF_PYTHON: only Python can check pivots
     N_ROWS,  # number of independent rows
     N_ADDED,  # number of rows g that are added to a singular M as s g^T g
-    FIRST_ROW,  # begin of two lists, one after the other: indices of the independent rows, and of the added rows
+    FIRST_ROW,  # index at which two lists begin: first the indices of independent rows, then those of the added rows g
 ) = range(4)
 OF_PYTHON = 100
 
@@ -259,10 +259,10 @@ def _has_consistent_rows(w, b, n):
 
 @merged
 def _start_run(f, checked_kit, w, b, t, t1, q, v, records, checks):
-    """Check the start of a run from t to t1, and prepare the run; return 0, or REFUSED, IN_DOUBT or UNCHOSEN.
+    """Check and prepare the start of a run from t to t1; return 0 if the run may begin, else a code such as REFUSED.
 
-    `checked_kit`: kit with the callbacks of the user, which check the start (`f` may also have derived ones); `checks`:
-    what Python has checked, such as STATE_CHECKED; `records`: data of earlier positions, see `evaluate_start`.
+    `checked_kit`: kit with the user's callbacks, which check the start (callbacks of `f` may be derived from them).
+    `checks`: what Python has checked, such as STATE_CHECKED. `records`: data of earlier positions (`evaluate_start`).
     """
     n = q.size
     if not (finite_vector(q) and finite_vector(v)):
@@ -329,7 +329,7 @@ def _restore_start(b):
 
 N_EQUAL = 0  # last_start[N_EQUAL]: number of successive runs from the last start, counted up to 2
 START = 1  # last_start[START:]: the last start, [t, t1, q, v], where t1 is the end of the run
-NEVER, IS_SAVED = 0.0, 2.0  # last_start[N_EQUAL] is NEVER if no run could begin, IS_SAVED if `saved` has the data
+NEVER, IS_SAVED = 0.0, 2.0  # if last_start[N_EQUAL] is NEVER, the last start is not reused; IS_SAVED: it is in `saved`
 
 
 @exact
@@ -348,7 +348,7 @@ def _equals_last_start(last_start, t, t1, q, v):
 (
     N_STATES,  # number of states, including the first
     N_STEPS,  # number of steps
-    NOTHING_TO_CHECK,  # 1: no jump of velocities, no singular position near, no changes too fast for samples; else 0
+    NOTHING_TO_CHECK,  # 1: no jump of velocities, no singular position near, no force too fast to be sampled; else 0
     JUMPED,  # 1: velocities jumped in the last step (see MAX_CHANGE_RATIO); else 0
     IN_CHECKED_REGION,  # 1: all states are in the region in which callbacks agreed with their traces; else 0
     DEFECT_KNOWN,  # 1: the defect (of accelerations) was evaluated in every step; else 0

@@ -1,7 +1,7 @@
 """Interpolate states within steps by polynomials through neighbouring states, and project the results.
 
 Row i of `states` is [q, v, a] at the time t[i]; interval i is between rows i and i + 1. If a method takes long steps,
-`fill_intervals` first computes states within an interval, for its polynomial to interpolate. `f`: kit, `w`: workspace.
+`fill_intervals` first computes states within an interval, which its polynomial interpolates. `f`: kit, `w`: workspace.
 """
 
 import numpy as np
@@ -19,13 +19,14 @@ CHECKED_FRACTIONS = (0.3, 0.7)  # times at which polynomials are checked, as fra
 N_CHECKED_TIMES = len(CHECKED_FRACTIONS)
 EPS = 2.0**-52  # spacing of floating-point numbers at 1
 MAX_GAP_RATIO = 8.0  # neighbouring steps count as equally long if the longest is at most this multiple of the shortest
-# v is interpolated, not the derivative of q, if (rounding error of q) / (duration) exceeds this number of tolerances
+# v has polynomials of its own if (rounding error of q) / (interval's duration) exceeds this number of v's tolerances
 MAX_VELOCITY_ROUNDING = 10.0
-# pivot ratio: smallest / largest pivot of the constraint Jacobian at a position, see min_pivot_ratio in partition.py
-SINGULAR_PIVOT_RATIO = 0.01  # a position is singular below this part of the larger pivot ratio at the interval's ends
-SINGULAR_PIVOT = 1e-5  # a position is singular if its pivot ratio is below this
-# a position with a pivot ratio (smallest / largest pivot) below WEAK_PIVOT is singular if its projection has removed a
-# constraint violation of v, about (pivot ratio) * (change of v), below MAX_VIOLATION tolerances, which may be rounding
+# pivot ratio: smallest / largest pivot of the constraint Jacobian (partition.py). A position is singular if its ratio
+# is below SINGULAR_PIVOT, or below SINGULAR_PIVOT_RATIO times the larger ratio at the ends of its interval
+SINGULAR_PIVOT_RATIO = 0.01
+SINGULAR_PIVOT = 1e-5
+# a position is also singular if its pivot ratio r is below WEAK_PIVOT, and r * (change of v by projection, in units of
+# the tolerances) is below MAX_VIOLATION: this product is about the violation removed, perhaps due to rounding only
 MAX_VIOLATION, WEAK_PIVOT = 10.0, 0.05
 
 
@@ -35,7 +36,7 @@ def _node_range(low, high, i, last):
 
     The interval is in the middle of these states, unless an index would be below `low` or above `high`.
     """
-    if last > i + 1:  # `fill_intervals` has added states within the interval: interpolate no others
+    if last > i + 1:  # `fill_intervals` has added states within the interval: interpolate only its own states
         return i, last
     n_states = min(kinds.WINDOW, high - low + 1)
     lo = max(low, min(i + 1 - n_states // 2, high + 1 - n_states))
@@ -219,13 +220,13 @@ def _state_difference(tolerances, scale_q, scale_v, states, i, q, v, q_other, v_
         change_q = scale_q * abs(q_other[m] - q[m]) / (atol + rtol * abs(states[i, m]))
         change_v = scale_v * abs(v_other[m] - v[m]) / (atol + rtol * abs(states[i, n + m]))
         largest, total = max(largest, change_q, change_v), total + change_q + change_v
-    # `total` is not finite if the times of two interpolated states coincide, as in a step of a few spacings of times
+    # `total` is not finite if two interpolated states have equal times, as after a step no longer than rounding of t
     return largest if np.isfinite(total) else np.inf
 
 
 @merged
 def _evaluate_accelerations(kind, h, s, z, c, size, z_v, c_v, size_v, a):
-    """Store in `a` derivatives of the polynomials: accelerations at t[i] + s h. See `_evaluate_polynomials`."""
+    """Store in `a` the accelerations by the polynomials of an interval; arguments as for `_evaluate_polynomials`."""
     for m in range(a.size):
         value, slope, curvature = c[size - 1, m], 0.0, 0.0
         for r in range(size - 2, -1, -1):
@@ -253,17 +254,16 @@ def _has_similar_gaps(t, lo, hi):
 
 @kernel(i8(KIT, WORK, f8, VECTOR, VECTOR, MATRIX, TABLE, VECTOR, MATRIX, MATRIX, VECTOR))
 def estimate_errors(f, w, tolerance, tolerances, t, states, groups, z, coefficients, rows, out):
-    """Store in out[g] the estimated error of the polynomials of interval g of `groups`, in units of the tolerances.
+    """For each interval g of `groups`, store in out[g] the estimated error of its polynomials, in tolerances.
 
-    The estimate is the first of these that applies (`tolerance`: of the projection; z, coefficients, rows: scratch):
+    There are three estimates (`tolerance`: of the projection; z, coefficients, rows: scratch):
     - 0, if the kind is SEPARATE or VELOCITIES, and the polynomials interpolate more than two states, which are about
       equally spaced and not inside the interval
-    - the change of the polynomials if they do not interpolate the last state. This needs more than two states, and a
-      change of at most 1. For the kind VELOCITIES, any change will do: the next estimate needs accelerations, which
-      contain the noise of stiff modes for this kind
-    - the larger of two differences at CHECKED_FRACTIONS: between a state before and after its projection; and between
-      accelerations by the polynomials and by the equations of motion. The latter, times dt = h / (number of
-      coefficients), counts as an error of velocities, and times dt^2 as an error of positions
+    - otherwise, with more than two states: the change of the polynomials when the last state is not interpolated. It is
+      used if it is at most 1, or if the kind is VELOCITIES, whose accelerations contain noise of stiff modes
+    - otherwise, the larger of two differences at CHECKED_FRACTIONS: between a state before and after its projection;
+      and between accelerations by the polynomials and by the equations of motion. With dt = h / (number of
+      coefficients), dt times the second difference counts as an error of v, and dt^2 times it as an error of q
     """
     n = w.Q.size
     half = z.size // 2
@@ -315,7 +315,7 @@ def estimate_errors(f, w, tolerance, tolerances, t, states, groups, z, coefficie
 
 @kernel(i8(KIT, WORK, VECTOR, MATRIX, MATRIX))
 def fill_accelerations(f, w, times, states, out):
-    """Store [a, lam] at consistent states [q, v] in rows of `out`, NaN on failure; return the number of failures."""
+    """For each consistent state [q, v], store [a, lam] in a row of `out`, or NaN; return the number of failures."""
     n = w.Q.size
     code = SINGULAR
     failures = 0
@@ -344,9 +344,9 @@ def fill_accelerations(f, w, times, states, out):
 def fill_intervals(f, w, options, memory, memory_0, tolerances, state, new_state, t, states, intervals, out_t, out):
     """Divide intervals into equal steps of the method, and store the states; return the number of failed intervals.
 
-    `intervals`: indices of the intervals. Each interval gets the same number of rows in `out_t` (times) and `out`
-    (states): for its first state, the states between its steps, and its last state. If a step fails, the first time of
-    the interval becomes NaN. `memory_0`: the method's memory at the start of a run.
+    `intervals`: indices of the intervals. Each interval gets the same number of rows of `out_t` (times) and `out`
+    (states): one for its first state, one for each state between two steps, and one for its last state. If a step
+    fails, the interval's first row of `out_t` becomes NaN. `memory_0`: the method's memory at the start of a run.
     """
     n = w.Q.size
     n_rows = out_t.size // intervals.size

@@ -39,9 +39,9 @@ ArrayRanges = list[tuple[str, int, int, tuple[int, ...]]]  # for each array: nam
 class Layout(NamedTuple):
     """Offsets of the arrays of a workspace, which consists of a block of floats and a block of integers.
 
-    Kernels receive a table of the addresses and shapes of the arrays. `table` is this table, but with an array's offset
-    (bytes) within its block in place of its address. The masks `of_numbers` and `of_integers` are 1 where the address
-    of the block of floats, or of integers, must be added to `table`, and 0 elsewhere. The first `n_lasting` floats and
+    Kernels receive a table of the addresses and shapes of the arrays. In `table`, an offset (bytes) within a block
+    stands for each address: the address of the block of floats must be added where `of_numbers` is 1, and that of the
+    block of integers where `of_integers` is 1; both are 0 elsewhere. The first `n_lasting` floats and
     `n_lasting_integers` integers keep data from one step to the next; a step fills all others before it reads them.
     """
 
@@ -97,7 +97,7 @@ def _allocate_workspace(sizes: Sizes) -> Work:
 
 
 def keep_unused_workspace(work: Work) -> None:
-    """Keep a workspace for later runs unless it is large; above MAX_UNUSED, discard workspaces of the oldest sizes."""
+    """Keep a workspace for later runs unless it is large; of more than MAX_UNUSED, discard those used longest ago."""
     unused = _unused_workspaces.pop(work.sizes, [])
     if work.notes.base.size <= MAX_UNUSED_SIZE and len(unused) < MAX_UNUSED:
         unused.append(work)
@@ -129,10 +129,10 @@ def cached_run() -> Any:
 
 
 def _fixed_order_shapes(n_q: int, n_c: int, rank: int, form: FixedOrderSizes) -> tuple[dict[str, tuple[int, ...]], ...]:
-    """Return the shapes of float arrays, and of integer arrays, that have other shapes in the fixed-order form.
+    """Return {name: shape} of float arrays, and of integer arrays, that have special shapes in the fixed-order form.
 
-    The fixed-order form has no partition: all coordinates count as independent, and also as dependent, because steps
-    compare all predicted positions with the positions on the constraints.
+    The fixed-order form has no partition. All coordinates are listed as independent. They are also listed as dependent,
+    because steps compare predicted and projected positions of the dependent coordinates.
     """
     n, n_redundant = n_q + n_c, n_c - rank
     n_rows = n_c if form.dense_jacobian else 0
@@ -262,7 +262,7 @@ def _create_layout(
 
 
 def _array_ranges(shapes: Mapping[str, tuple[int, ...]]) -> tuple[dict[str, tuple[int, int, tuple[int, ...]]], int]:
-    """Return the first offset, end and shape of each array, by name, and the total length; align to cache lines."""
+    """Return {name: (first offset, end, shape)} of arrays that begin at cache lines, and the length of their block."""
     ranges, end = {}, 0
     for name, shape in shapes.items():
         size = math.prod(shape)

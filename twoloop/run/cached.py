@@ -80,7 +80,7 @@ N_FIRST_CHUNKS = 4
 N_SKIPPED_CALLS = 16  # after an exception in a callback, this number of calls do not use the cached integrator
 STEP_FIELDS = (*STEP_ARRAYS, "stats")  # fields of a result that are computed from the array of steps
 NON_STEP_DEFAULTS = {name: value for name, value in DEFAULTS.items() if name not in STEP_FIELDS}
-SHORT_RUN = 1e-3  # if the last run took less CPU time (s), measure elapsed time instead: reading that clock is faster
+SHORT_RUN = 1e-3  # if the last run took less CPU time (s), measure elapsed time: its clock is read faster
 HARMLESS = 0.01  # v0 need not satisfy the constraints exactly: projection may change v0 by this number of tolerances
 REACHED_END = Status.REACHED_END  # a global name is read faster than a member of an Enum
 
@@ -91,7 +91,7 @@ STEPS = OutputRequest()  # request for output at the ends of all steps, without 
 class RepeatRequest:
     """Result of a run that may have missed short changes of forces: the caller must repeat it."""
 
-    max_gap: float  # largest time between two evaluations in the repetition (s)
+    max_gap: float  # longest time (s) that the repetition allows between two evaluations
     cpu_time: float  # CPU time of the run to be repeated (s)
 
 
@@ -121,15 +121,15 @@ class CachedIntegrator:
         n_attempts = max(LANES, run.chunk * (N_FIRST_CHUNKS if run.plan.stable_to is None else 1))
         run.control[run.a.STORE_ALL], run.control[run.a.MAX_ATTEMPTS] = 1.0, n_attempts
         checked = system if self.parametric is None else self.parametric.system
-        # skips: number of next calls that will not use this integrator, because a callback has raised an exception
+        # skips: after an exception in a callback, this number of calls do not use this integrator
         self.evaluation, self.loops, self.code, self.skips = StartEvaluation(checked), cached_run(), code, 0
         self.arrays, self.callbacks = arrays_of(run, self.evaluation, code, definite, options, n_attempts), checked.kit
         self._start_and_advance = entry_point(self.loops.start_and_advance)
-        # `arrays.block` contains a report (numbers about the run, times and steps), and from the index states_begin on
-        # the states. A report on one state and no step begins at one_state_begin; longer reports begin earlier
+        # `arrays.block` contains a report (numbers about the run, times, steps), which ends at the index states_begin,
+        # then the states. A report on one state and no step begins at one_state_begin, longer reports before this index
         self.states_begin, self.width = self.arrays.report.size, len(run.state)
         self.one_state_begin = self.states_begin - self.loops.N_HEAD - 1
-        self.loop_used = False  # whether `IntegrationLoop` may have changed attributes of `run` other than arrays
+        self.loop_used = False  # True: `IntegrationLoop` may have changed attributes that `_return_to_start` restores
         self.attributes_at_start = {key: getattr(run, key) for key in ("plan", "memory", "chunk", "kit")}
         # form of linear algebra at the start; CPU time of the last run (s), infinite before the first run
         self.form, self.cpu_time = run.kit.flags[FORM], np.inf
@@ -141,8 +141,8 @@ class CachedIntegrator:
     @staticmethod
     def can_provide(run: Run, output: OutputRequest, shared: SharedSetup | None) -> bool:
         """Return whether a cached integrator can provide the requested `output`; if not, a new run must be set up."""
-        # states at output times and `result.sol` must agree, but would come from different interpolators. If systems
-        # share the run (`shared`), the next system would overwrite the parameters that `result.sol` uses
+        # refuse `result.sol` together with output times: states from two interpolators would not agree. Refuse it also
+        # if systems share the run (`shared`): the next system would overwrite the parameters that `result.sol` uses
         if output.dense and (output.interpolated_times is not None or shared is not None):
             return False
         return output.interpolated_times is None or not (
@@ -307,7 +307,7 @@ class CachedIntegrator:
         """Before the next run, restore attributes of `run` (other than arrays) that the last run may have changed."""
         run, self.loop_used = self.run, False
         if run.plan is self.attributes_at_start["plan"] and not run.substituted and run.kit.flags[FORM] == self.form:
-            # keep the present kit: it may call a step of this plan that `IntegrationLoop` has loaded meanwhile
+            # keep the kit of the last run: if `IntegrationLoop` has loaded a step of this plan, only this kit calls it
             self.attributes_at_start["kit"] = run.kit
         vars(run).update(self.attributes_at_start, crossings=[], jumps=[], sizes_to_try=[], substituted=False)
 
@@ -331,7 +331,7 @@ def fields_of(
     """Return the fields of the result of a run, from its record; `compiled`: whether steps called generated code."""
     fields = vars(record) | options.metadata | {"system": system, "atol": options.atol.copy(), "compiled": compiled}
     fields["t_end"] = t_end
-    if (own := options.own_tolerance) is not None:  # error_tol of Newmark: tolerance of positions in each step
+    if (own := options.own_tolerance) is not None:  # Newmark's tolerance of positions in each step
         error = own ** (2.0 / 3.0)  # error of a whole run whose steps meet this tolerance
         fields |= {"rtol": error, "atol": np.full(system.n_q, error), "untested": np.ones(len(record.h), dtype=bool)}
     return fields
@@ -364,7 +364,7 @@ def _deferred_field(
     return NON_STEP_DEFAULTS | state_fields(system.n_q, t, rows) | fields | options.metadata
 
 
-RECHECK_PIVOT = 0.1  # `set_up` checks a start if (smallest pivot of C_q) / (this pivot at first start) is below this
+RECHECK_PIVOT = 0.1  # `set_up` checks a start whose smallest pivot of C_q is below this part of the first start's pivot
 
 
 def arrays_of(
@@ -435,14 +435,14 @@ def arrays_of(
 
 
 def _choice_as_array(choice: PivotChoice | None) -> tuple[NDArray[np.int64], float]:
-    """Return the pivots of generated code, as an array of integers for kernels, and the factor s of terms added to M.
+    """Return `choice` as an array of integers for kernels, and the factor s of terms s g^T g added to M (g: row of G).
 
-    The array is empty if `choice` is None. If M is singular, the code adds s g^T g to M for some constraint rows g: so
-    M becomes definite. If nothing is added, s is 1.
+    The array is empty if `choice` is None. Generated code adds such terms to M, for example if M is singular: so M
+    becomes definite. If nothing is added, s is 1.
     """
     if choice is None:
         return np.zeros(0, dtype=np.int64), 1.0
-    # OF_PYTHON: kernels cannot check these pivots at a new start, because Python tried several terms s g^T g
+    # OF_PYTHON: if solutions are refined, kernels cannot repeat this choice at a new start: Python must choose rows
     index = cached_run().OF_PYTHON if choice.is_refined else int(np.searchsorted(-MIN_PIVOTS, -choice.min_pivot))
     numbers = index, len(choice.rows), len(choice.added_rows), *choice.rows, *choice.added_rows
     return np.array(numbers, dtype=np.int64), (*choice.scales, 1.0)[0]
@@ -463,7 +463,7 @@ class CacheEntry(NamedTuple):
     definite: bool  # whether M was definite at the start
     for_other_starts: bool  # whether a copy of the run may be moved to another start
     idle: list[CachedIntegrator] | None  # integrators not in use; None: each run needs `set_up`
-    shared: SharedSetup | None = None  # setup for systems that differ only in parameters; None: one system
+    shared: SharedSetup | None = None  # setup for systems that differ only in parameters; None: not shared
 
 
 # initial cache of a system's runs, a tuple: start (t0, q0, v0) of the last run, or None; cache entries by options;

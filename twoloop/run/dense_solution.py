@@ -34,9 +34,9 @@ Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 MAX_DIVIDED_INTERVALS = 512  # when states within more intervals than this are cached, the cache is emptied
-MAX_ACCURATE_INTERVALS = 65536  # largest number of intervals remembered to be accurate without states within them
-# a polynomial is accurate if it violates constraints and equations of motion by at most MAX_ERROR tolerances (across a
-# singular position, where velocity errors are ten times the violation, by at most MAX_ERROR_ACROSS tolerances)
+MAX_ACCURATE_INTERVALS = 65536  # the set of intervals with accurate polynomials is emptied when it is larger than this
+# a polynomial is accurate if it violates constraints and equations of motion by at most MAX_ERROR tolerances. Across a
+# singular position, velocity errors are ten times the violation: there the limit is MAX_ERROR_ACROSS tolerances
 MAX_ERROR, MAX_ERROR_ACROSS = 10.0, 1.0
 N_REPAIR_STEPS = 4  # number of steps into which an interval is divided if its polynomial is not accurate
 
@@ -65,8 +65,8 @@ class Interpolator:
     """Interpolator between the states of a `StateTable`, with a workspace of its own.
 
     `t0`, `row`: time and [q, v, a] of a state of the run. `ranks`: rank of C_q, and rank of all constraint rows.
-    `plans`: intervals of these kinds are too long for one polynomial; the method of the plan divides each interval into
-    `plan.parts` equal steps.
+    `plans`: a plan for each kind of intervals that are too long for one polynomial. The method of the plan divides such
+    an interval into `plan.parts` equal steps.
     """
 
     def __init__(
@@ -97,7 +97,7 @@ class Interpolator:
         # key: time at which a step across a singular position begins; value: the step's `memory`, with a polynomial
         self.crossing_memories: dict[float, Array] = {}
         self.accurate_intervals: set[float] = set()  # start times of intervals with an accurate polynomial
-        self.may_divide = True  # whether to compute states within intervals; False: they were read from a file
+        self.may_divide = True  # whether to compute states within intervals; False: such states were read from a file
         self._allocate_scratch()
 
     def _create_workspace(self) -> None:
@@ -105,7 +105,7 @@ class Interpolator:
         system, t0, row = self.arguments[:3]
         q0, form = row[: system.n_q], self.fixed_order
         for plan in self.plans.values():
-            load_step(plan.second)  # `result.sol` may need the second step of a pair of methods at any time: load it
+            load_step(plan.second)  # import the step of the second method of a pair, to which a kernel may switch
         self.kits = {kind: make_kit(system, t0, q0, plan, form) for kind, plan in self.plans.items()}
         self.kit = make_kit(system, t0, q0, None, form)
         pattern = pattern_of(system, t0, q0) if form is None else np.zeros((0, 0))
@@ -117,7 +117,7 @@ class Interpolator:
         from twoloop.kernels import advance
 
         system, t0, row = self.arguments[:3]
-        self.work.notes[indices.GENERATION] = 1.0  # number of partitions so far: above 0, kernels keep the given ranks
+        self.work.notes[indices.GENERATION] = 1.0  # number of partitions so far; above 0, kernels use `self.ranks`
         state = np.concatenate([row, np.zeros(system.n_c + system.n_a)])
         entry_point(advance.start)(self.kit, self.work, t0, state)
         self.repair_plans: dict[bool, tuple[Plan, Any]] = {}
@@ -125,7 +125,7 @@ class Interpolator:
     def reset(self, system: ConstrainedSystem, t0: float, row: Array, pattern: Array) -> None:
         """Reset the interpolator for another run with the same compiled functions (kits).
 
-        `row`: [q, v, a] at its start t0. `pattern`: matrix with 1 where its constraint rows may be nonzero, else 0.
+        `row`: [q, v, a] at the start of that run, t0. `pattern`: 1 for entries of [C_q; A] that may be nonzero, else 0.
         """
         self.arguments = (system, t0, row.copy(), *self.arguments[3:])
         self.system, self.may_divide = system, True
@@ -294,7 +294,7 @@ class Interpolator:
         return self._states_in_crossing_step(table, i, plan.memory) if succeeded else None
 
     def _states_in_crossing_step(self, table: StateTable, i: int, memory: Array) -> tuple[Array, Array]:
-        """Return times and states within interval i from the polynomial of a crossing step, stored in its `memory`."""
+        """Return times and states within interval i, given the `memory` where a crossing step stored a polynomial."""
         from twoloop.kernels.steps.crossing_step import state_at
 
         n, options = self.system.n_q, crossing_plan(self.system.n_q).options
@@ -367,7 +367,7 @@ class Interpolator:
     def interior_blocks(self, table: StateTable) -> Iterator[tuple[Array, Array]]:
         """Yield the states within all divided intervals, in blocks, so that the caller can store them in a file.
 
-        A block has times (m, parts + 1) and rows [q, v, a] (m, parts + 1, 3 n_q) of m intervals. Missing: NaN.
+        A block has times (m, parts + 1) and rows [q, v, a] (m, parts + 1, 3 n_q) of m intervals; unused ones are NaN.
         """
         intervals = _interval_rows(table, np.arange(len(table.t) - 1))
         for block in _blocks_of_intervals(intervals):
@@ -503,7 +503,7 @@ class DenseState:
         self.q, self.v = self._columns_by_time(rows[:, :n]), self._columns_by_time(rows[:, n:])
 
     def _columns_by_time(self, rows: Array) -> Array:
-        """Return `rows`, given at ascending times, as columns in the order of `self.t`; the only row for a scalar."""
+        """Return `rows` (at ascending times) as columns ordered as `self.t`; if `self.t` is a number, the only row."""
         columns = np.empty(rows.shape[::-1])
         columns[:, self._order] = rows.T
         return columns if np.ndim(self.t) else columns[:, 0]
@@ -539,12 +539,12 @@ class DenseSolution:
 
     Some steps are too long for such polynomials: steps of `RungeKutta` of order 6 and more (with Newton's method, of
     order 7 and more), of `Taylor` and of `Lobatto16`, also within `auto`. Each such step is divided into 2 to 6 equal
-    steps of the method when a time within it is first evaluated; to divide all steps costs about as much as the run. If
-    leaving out the last state changes a polynomial by more than the tolerances, the constraints and equations of motion
-    are evaluated at two times in the interval. The polynomial may violate them beside a singular position or a jump of
-    a force. Then three other polynomials are tried: through states of a step across the position, through ends of four
-    steps of `DOP853` (after Newton's method: of a Radau method), and through the ends of the interval. The statistics
-    of the run do not count these evaluations.
+    steps of the method when a time within it is first evaluated; to divide all steps costs about as much as the run.
+    If a polynomial changes by more than the tolerances without the last of its states, constraints and equations of
+    motion are evaluated at two times in the interval. The polynomial may violate them beside a singular position or a
+    jump of a force. Then three other polynomials are tried: through states of a step across the position; through the
+    ends of four steps of `DOP853`, or of a Radau method if Newton's method solved the outer loop; and through the ends
+    of the interval only. The statistics of the run do not count these evaluations.
 
     The solution takes 8 (2 + 3 n_q) bytes of memory per step.
 

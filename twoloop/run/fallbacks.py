@@ -23,7 +23,7 @@ from twoloop.run.workspace import kit_for_plan, make_kit
 
 # let r be (duration of the shortest change of forces or drives seen in a run) / (longest time between evaluations). If
 # r < REPEAT_BELOW, the run may have missed shorter changes, and is repeated. If r < WARN_BELOW, the run may even have
-# missed changes of this duration: it warns if it is not repeated any more
+# missed changes of this duration: it warns, unless it is repeated
 REPEAT_BELOW, WARN_BELOW = 2.0, 1.25
 EVALUATIONS_PER_CHANGE = 4.0  # number of evaluations that a repetition makes within the shortest change seen so far
 MAX_REFINEMENT = 8.0  # largest factor by which a repetition reduces the longest time between evaluations
@@ -43,7 +43,7 @@ def gap_for_repetition(run: Run) -> float:
 
 
 def warn_of_missed_changes(run: Run) -> str:
-    """Warn if a run may have missed short changes of forces, and is not repeated; return the warning, or ""."""
+    """Warn if a run that is not repeated may have missed short changes of forces; return the warning, else ""."""
     if not may_have_missed_changes(run, WARN_BELOW):
         return ""
     a, clock = run.a, run.clock
@@ -66,10 +66,10 @@ MAX_RESIDUAL = 1e-8  # largest residual of a constraint rate after a jump, relat
 
 
 def state_after_jump(system: ConstrainedSystem, t: float, q: Array, v: Array) -> Array | None:
-    """Return a consistent state [q, v] at t near the given one; None if no velocities are consistent.
+    """Return [q, v] at t after a drive's velocity has jumped; None if no velocities satisfy the constraints.
 
-    This is necessary after a jump of the rate C_t, or of b in A v + b = 0: impulses p of the constraints then change v
-    to v+. The equations M (v+ - v) + G^T p = 0 and G v+ + (C_t, b) = 0 are solved for v+ and p.
+    (q, v): state before the jump of C_t, or of b in A v + b = 0. The jump causes impulses p of the constraints, which
+    change v to v+. The equations M (v+ - v) + G^T p = 0 and G v+ + (C_t, b) = 0 are solved for v+ and p.
     """
     q = corrected_positions(system, t, q)
     rows, rates = system.rows(t, q), -system.velocity_constraint(t, q, v)
@@ -175,18 +175,18 @@ NODE_DISTANCES = 1.0, 0.5, 0.25  # values that are tried in turn for the field `
 
 
 class Limits(NamedTuple):
-    """Limits for the polynomial and step across a singular position; if no step succeeds, wider ones are tried."""
+    """Limits of a polynomial across a singular position and of its steps; if no step succeeds, wider ones are tried."""
 
     has_wide_gaps: bool  # whether the longest allowed time between evaluations is multiplied by GAP_FACTOR
     may_approach: bool  # whether a step may end before the singular position, but nearer to it than the step began
-    tolerance_factor: float  # factor by which the tolerances of these steps are multiplied
-    # the polynomial uses only nodes whose distance from the position is at least this factor times the usual limit:
-    # nearer nodes have larger rounding errors. But if the motion is slow near the position, few nodes are far enough
+    tolerance_factor: float  # factor by which the run's tolerances are multiplied in steps across the singular position
+    # factor on the pivot of C_q below which nodes of the polynomial are left out, because their rounding errors are
+    # large. A smaller factor leaves out fewer nodes, which helps if the motion is slow near the singular position
     node_distance: float
 
 
 class Origin(NamedTuple):
-    """Begin and limits of a polynomial across a singular position; several step sizes are tried with one Origin."""
+    """Beginning and limits of a polynomial across a singular position; several step sizes are tried for each Origin."""
 
     earliest: float  # no node of the polynomial is before this time (s)
     base: TimedState | None  # earlier state at which the polynomial begins; None: it begins at the current state
@@ -214,7 +214,7 @@ def switch_method(run: Run) -> None:
     """Continue a run with the substitute for its method, because this method fails or does not suit the motion."""
     substitute = run.plan.substitute
     assert substitute is not None
-    run.plan, run.memory = substitute.fresh(), substitute.memory  # `run.memory` keeps the initial values of the memory
+    run.plan, run.memory = substitute.fresh(), substitute.memory  # `run.memory`: the new method's initial memory
     renew_kit(run)
     run.substituted = True
     run.write_step_control(run.plan)
@@ -233,9 +233,9 @@ def renew_kit(run: Run) -> None:
 
 
 def cross_singularity(run: Run, past: list[TimedState]) -> tuple[Plan, Array]:
-    """Prepare steps across a singular position, see kernels/steps/crossing_step.py; return their plan and `control`.
+    """Prepare steps across a singular position, see kernels/steps/crossing_step.py; return their plan and settings.
 
-    Set the first step size, and list the polynomials to try in `run.origins`. `control`: array of settings that
+    Set the first step size, and list the polynomials to try in `run.origins`. The settings are the array `control` that
     `advance` reads. `past`: states of the last accepted steps, oldest first; may be empty.
     """
     a, clock = run.a, run.clock
@@ -246,15 +246,15 @@ def cross_singularity(run: Run, past: list[TimedState]) -> tuple[Plan, Array]:
     base, run.mirrored_size = None, 0.0
     if not has_fixed_step:
         base, run.mirrored_size = _find_base_state(run, [(t, state) for t, state in past if t >= earliest])
-    # try polynomials that begin at several states: a polynomial may have nodes before a jump of a force, too few nodes
-    # (near the start or the end of the run), or be too long (from an old state)
+    # try several beginnings of the polynomial, because one may fail: the polynomial may have nodes before a jump of a
+    # force; it may have too few nodes near the start or end of the run; or it may be too long, if it begins early
     h_long, compiled = float(clock[a.H_LONG]), not run.system.called_in_python
     near_start = compiled and _is_near_start(run)
     near_end = compiled and clock[a.T] + LARGEST_RATIO * h_long > run.t1
     origins = [(earliest, base), *[(earliest, None)] * (base is not None), *[(-np.inf, None)] * bool(near_start)]
     origins.append((np.inf, None))
     ends = [False, True] if near_end and not has_fixed_step else [False]
-    if run.mirrored_size > run.t1 - clock[a.T]:  # the run ends soon after the position: first try a step beyond t1
+    if run.mirrored_size > run.t1 - clock[a.T]:  # a singular position is near t1: first try steps that end beyond t1
         ends.reverse()
     run.origins = [Origin(*start, limits, beyond) for limits in _limits(run) for beyond in ends for start in origins]
     run.attempts_left = np.inf if compiled else MAX_ATTEMPTS_IN_PYTHON
@@ -289,7 +289,7 @@ def _is_near_start(run: Run) -> bool:
 
 
 def _prepare_next_origin(run: Run, plan: Plan, control: Array) -> None:
-    """Begin the next polynomial of `run.origins`: store its origin in the plan's memory; set step sizes and limits."""
+    """Take the next Origin of a polynomial from `run.origins`; store it for `crossing_step`, and set its step sizes."""
     from twoloop.kernels.steps.crossing_step import begin_polynomial
 
     a, clock = run.a, run.clock
@@ -314,11 +314,11 @@ def _prepare_next_origin(run: Run, plan: Plan, control: Array) -> None:
 
 
 def _find_base_state(run: Run, past: list[TimedState]) -> tuple[TimedState | None, float]:
-    """Return the base (first state) of a polynomial across a singular position, and a step size (s) from the base.
+    """Return where a polynomial across a singular position begins (None: at the current state), and a step size (s).
 
-    Rounding changes velocities near the position. So the base is the latest state in `past` that is far from it, or
-    the farthest state if none is far, or None if the current state is the farthest. The step size is such that the step
-    would end as far beyond the position as the base is before the position, if distances changed linearly.
+    Near the position, rounding changes velocities. So the polynomial begins at the latest state that is far from the
+    position, or at the farthest state if none is far. `past`: earlier states. The step size is such that the step would
+    end as far beyond the position as the polynomial begins before the position, if distances changed linearly.
     """
     a, clock, t, n = run.a, run.clock, float(run.clock[run.a.T]), run.system.n_q
 
@@ -366,10 +366,10 @@ def crossing_kit(kit: Kit) -> Kit:
 
 
 def handle_crossing(run: Run, plan: Plan, control: Array, code: int, n_accepted: int) -> tuple[Plan, Array, int]:
-    """Decide how to go on after an attempt to cross a singular position; return plan, `control` and code of next steps.
+    """Decide how to go on after an attempt to cross a singular position; return a plan, its settings, and a code.
 
-    If the attempt has yielded a polynomial, the next steps follow this piece by piece. If the attempt failed, another
-    step size or polynomial is tried. After the crossing, or if all attempts failed, the run's own method continues.
+    Follow a computed polynomial piece by piece; if the attempt failed, try another step size or polynomial. After the
+    crossing, or if all attempts failed, return to the run's own method. The returned code is PAUSED if the run goes on.
     """
     from twoloop.kernels.steps import crossing_step as kernels
 

@@ -78,20 +78,20 @@ from twoloop.run.singular_positions import TimedState, has_velocity_jump_at_end
 
 Array = NDArray[np.float64]
 
-MAX_STORED_SIGNALS = 3  # number of Ctrl-C signals that are stored; the next raises KeyboardInterrupt: no result
+MAX_STORED_SIGNALS = 3  # number of Ctrl-C signals that are stored; one more raises KeyboardInterrupt, without a result
 
 
 class Interrupts:
     """Handler of Ctrl-C during a run. It replaces Python's own handler, but never one that the user has installed.
 
-    The handler is active from `install_handlers` to `restore_handlers`. Before, Ctrl-C raises KeyboardInterrupt.
+    The handler is active from `install_handlers` to `restore_handlers`. Before that, Ctrl-C raises KeyboardInterrupt.
     """
 
     n_signals, _is_installed = 0, False  # n_signals: number of times that Ctrl-C was pressed
     handlers: SignalHandlers | None = None
 
     def install_handlers(self) -> "Interrupts":
-        """Install handlers that store signals, or raise an exception within functions of the user; return self."""
+        """Install `SignalHandlers`, and a handler that stores Ctrl-C if no function of the user runs; return self."""
         if self.handlers is None:
             self.handlers = SignalHandlers()
         if _signal.getsignal(signal.SIGINT) is signal.default_int_handler:
@@ -107,7 +107,7 @@ class Interrupts:
         """
         if self.handlers is None and raised_by_handler(error):
             return False
-        self.install_handlers()  # a signal that arrives meanwhile may raise an exception
+        self.install_handlers()  # if a signal arrives during this call, it may raise an exception
         return self._is_installed and self.n_signals <= MAX_STORED_SIGNALS
 
     def restore_handlers(self) -> None:
@@ -131,7 +131,7 @@ def describe_interrupt(t: float, table: Array) -> str:
 
 
 def interrupted_fields(system: ConstrainedSystem, t0: float, events: list[Any] | None, method: str) -> dict[str, Any]:
-    """Return the fields, without states, of a run that Ctrl-C ended before its first step."""
+    """Return the fields of the result of a run that Ctrl-C ended before its first step; the result has no states."""
     table = np.zeros((0, 3 * system.n_q + system.n_c + system.n_a))
     fields = state_fields(system.n_q, np.zeros(0), table) | {"h": np.zeros(0), "stats": Statistics(n_accepted=0)}
     message = describe_interrupt(t0, table) + failure_link(Status.INTERRUPTED)
@@ -145,17 +145,17 @@ def interrupted_fields(system: ConstrainedSystem, t0: float, events: list[Any] |
 BUFFER_ROWS = 1024  # largest number of states that one call of `advance` stores
 BUFFER_STEPS = 4096  # largest number of steps whose data one call of `advance` stores
 CHUNK_TO_EVENT = 16  # attempted steps in a chunk if an event may end the run, because steps beyond the event are wasted
-# the number of steps per chunk is doubled while a chunk takes less CPU time (s); Ctrl-C takes effect after a chunk
+# if a chunk takes less CPU time (s) than this, the next one has twice as many steps; Ctrl-C takes effect after a chunk
 CHUNK_TIME = 0.05
 # statuses whose message may say that stability limited the steps
 STATUSES_WITH_STIFFNESS_NOTE = {Status.REACHED_END, Status.EVENT, Status.MAX_STEPS, Status.TIME_LIMIT, Status.STAGNATED}
 # the polynomial across a singular position may begin at one of the last N_RECENT states, or at the end of one of the
-# last N_RECENT long steps before these; long steps are searched for among the last N_LAST_STATES states
+# N_RECENT last long steps (at least COLLAPSED_STEP * clock[H_LONG]) before these, within the last N_LAST_STATES states
 N_RECENT, N_LAST_STATES = 16, 256
 CROSSING_OVERSHOOT = 100.0  # a crossing step may end beyond t1 by at most this multiple of the run's duration
 NO_KINDS = np.zeros(0, dtype=np.int64)  # kinds of intervals if no states between steps are requested
 # MAX_SPARE: largest number of sets of buffers (times, states, steps of a chunk) kept for later runs. MAX_SPARE_FLOATS:
-# sets with more floats in the buffer of states are not kept
+# sets whose buffer of states has more floats than this are not kept
 MAX_SPARE, MAX_SPARE_FLOATS = 16, 250_000
 _spare_buffers: dict[tuple[int, int, int], Buffers] = {}  # sets of buffers for later runs, by their sizes
 
@@ -166,7 +166,7 @@ class IntegrationLoop:
     `start`: None if the run is at its start. If the caller has already taken the first chunk of steps, `start` is the
     row [q, v, a, lam] at the start, and the caller then calls `add_first_chunk`. `system`: system in the result,
     given if later runs will overwrite arrays of `run.system`. `report`: called after each chunk with the time reached.
-    `is_final_attempt`: whether to warn if the run may have missed short changes of forces; else the caller repeats it.
+    `is_final_attempt`: warn if the run may have missed short changes of forces (if False, the caller repeats the run).
     """
 
     def __init__(
@@ -197,12 +197,12 @@ class IntegrationLoop:
         has_terminal_event = request.events is not None and any(event.terminal < np.inf for event in request.events)
         if has_terminal_event:
             self.largest_chunk = run.chunk = CHUNK_TO_EVENT
-        # progress is checked after every `check_interval` attempted steps; `next_check`: their number at the next check
+        # progress is checked every `check_interval` attempted steps, next after `next_check` attempted steps in the run
         self.check_interval = self.next_check = run.chunk
         self.plan, self.control, self.kit = run.plan, run.control, run.kit  # replaced while steps cross a singularity
         self.counts = INITIAL_COUNTS.copy()
         self.latest_chunks: list[tuple[Array, Array]] = []  # times and rows of the last chunks, see _last_states
-        self.step_parts = [np.empty((0, run.a.N_STEP_COLUMNS))]  # an empty array, and rows of steps to be stored
+        self.step_parts = [np.empty((0, run.a.N_STEP_COLUMNS))]  # an empty array, then rows of steps not stored yet
         if self.request.store.append_only:
             self._store_step_fields()
         self.n_filled = np.zeros(2, dtype=np.int64)
@@ -215,7 +215,7 @@ class IntegrationLoop:
         self.code = INTERRUPTED if interrupts.n_signals else run.a.PAUSED
 
     def add_first_chunk(self, code: int, t: Array, rows: Array, steps: Array, cpu_time: float) -> None:
-        """Record the first chunk, which the caller has taken, and act on `code`, which `advance` returned to it."""
+        """Record the first chunk, which the caller has taken, and handle the `code` that `advance` returned."""
         self.code, self.cpu_time = code, cpu_time
         self._store_chunk(t.copy(), rows.copy(), steps.copy(), self._interval_kinds(steps, False, False))
         self._handle_code(steps, False, cpu_time)
@@ -306,7 +306,7 @@ class IntegrationLoop:
 
     @contextmanager
     def _deadline_timer(self) -> Iterator[None]:
-        """Within this context, stop machine code at the deadline by a timer, if a single step may take long."""
+        """While this context is active, a timer stops machine code at the deadline, if a single step may take long."""
         run, notes = self.run, self.run.work.notes
         if self.deadline == np.inf or (run.system.n_q <= SMALL_SYSTEM and not run.system.called_in_python):
             yield
@@ -363,7 +363,7 @@ class IntegrationLoop:
             self.code = INTERRUPTED
 
     def _choose_method(self, in_crossing: bool, n_steps: int) -> None:
-        """If `self.code` says that the steps cannot continue, choose other steps, and set the code to PAUSED."""
+        """If `self.code` asks for another method, form or state, choose it, and set the code to PAUSED to go on."""
         run, a = self.run, self.run.a
         if self.code == a.NEEDS_DENSE or run.may_succeed_in_other_form(self.code):
             run.change_form()
@@ -413,7 +413,7 @@ class IntegrationLoop:
             self.latest_chunks[-1][1][-1, : len(row)] = row
 
     def _needs_substitute(self, in_crossing: bool) -> bool:
-        """Return whether another method must take over because steps became too small far from singular positions."""
+        """Return whether another method must take over because of STEP_TOO_SMALL far from singular positions."""
         run, a = self.run, self.run.a
         is_too_small = self.code == a.STEP_TOO_SMALL and run.control[a.MAY_SWITCH] == 1.0
         return is_too_small and not in_crossing and run.work.notes[indices.NEARLY_SINGULAR] != 1.0
@@ -495,7 +495,7 @@ class IntegrationLoop:
         return list(zip(t.tolist(), table, strict=True))
 
     def _next_buffers(self) -> Buffers:
-        """Return buffers for the times, states and steps of a chunk; each attempt fills at most one row of each."""
+        """Return buffers for the times, states and steps of a chunk; attempted steps fill at most one row of each."""
         chunk, width = self.run.chunk, len(self.run.state)
         n_rows, n_steps = max(min(chunk, BUFFER_ROWS), LANES), max(min(chunk, BUFFER_STEPS), LANES)
         spare_buffers = _spare_buffers.pop((n_rows, n_rows * width, n_steps), None)

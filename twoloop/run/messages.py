@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 INTERRUPTED, STAGNATED, OUT_OF_TIME = -1, -2, -3  # end codes of a run, in addition to those that `advance` returns
-STAGNATION_STEPS = 20_000  # a run is checked for a stall once per (about) this number of accepted steps
+STAGNATION_STEPS = 20_000  # a run is checked for a stall whenever about this number of further steps is accepted
 # a run stalls if the rest of the run would take more than MAX_STEPS_LEFT steps (days of computing). It also stalls if
 # the rest would take more than STAGNATION_LEFT steps, and (mean step size) / (largest step size) < STAGNATION_PACE
 STAGNATION_PACE, STAGNATION_LEFT, MAX_STEPS_LEFT = 1e-3, 1e7, 1e11
@@ -63,7 +63,7 @@ class StallDetector:
         self.window_n += len(h)
 
     def is_stalled(self, t: float, t1: float) -> bool:
-        """Return whether the run takes too many more steps; False unless STAGNATION_STEPS new steps were added."""
+        """Return whether too many steps (see StallDetector) are left from t to t1; False until another check is due."""
         if self.window_n < STAGNATION_STEPS:
             return False
         self.mean_step = (t - self.window_t) / self.window_n
@@ -85,8 +85,8 @@ INITIAL_FACTOR = 0.1
 # in a power iteration x -> J x, the dominant eigenvalue of J is negative if cos(x, J x) is below minus this number
 MIN_ALIGNMENT = 0.9
 MIN_STEPS = 200  # after fewer accepted steps, a message does not mention stiffness
-# stability limited the steps if the median, over all samples, of h * rate / limit is at least this; 0.4 is typical of
-# smooth motion. h: step size. rate: of the fastest vibration or decay. limit: largest h * rate with a stable method
+# let h be the step size, and `rate` that of the fastest vibration or decay: a method is stable while h * rate <= limit.
+# Stability limited steps if the median of h * rate / limit in all samples is this or more; 0.4 is typical otherwise
 MIN_STABILITY_RATIO = 0.45
 
 
@@ -172,9 +172,9 @@ def _fastest_rates(kit: Any, work: Any, sample: StiffnessSample, directions: lis
 def _dominant_eigenvalue(
     kit: Any, work: Any, sample: StiffnessSample, direction: Array, independent: NDArray[np.int64], by_v: bool
 ) -> tuple[float, bool]:
-    """Find the dominant eigenvalue of dF/dq (of dF/dv if `by_v`) by power iteration; return (|value|, is negative).
+    """Return |x| and whether x < 0, for the dominant eigenvalue x of dF/dq, or dF/dv if `by_v` (F: accelerations).
 
-    F: accelerations of the coordinates `independent` (indices). `direction`: first vector, becomes the eigenvector.
+    Only the coordinates `independent` (indices) vary. `direction`: first vector of the iteration, then the eigenvector.
     """
     from twoloop.kernels.evaluation import tasks
 
@@ -223,10 +223,10 @@ _FAILURE_REASONS = {
 
 
 def message_of(run: "Run", text: str, system: "ConstrainedSystem") -> dict[str, Any]:
-    """Return {"message": text}, or {"later": function} if the text will be computed when it is first read.
+    """Return {"message": text}, or {"later": function} with a function that completes the text when it is first read.
 
     A description of the singular positions that the run crossed takes longer than many runs: so a text with such a
-    description is computed later. Until then `system` must not change, but the arrays of the run may.
+    description is completed later. Until then `system` must not change, but the arrays of the run may.
     """
     if CROSSINGS_MARK not in text:
         return {"message": text}
@@ -265,7 +265,7 @@ def describe_rounding(run: "Run", states: list[TimedState], end: float) -> str:
     system, n = run.system, run.system.n_q
     for t, state in sorted({each[0]: each for each in states}.values(), key=itemgetter(0)):
         q, v = state[:n], state[n : 2 * n]
-        at_singular_start = t == run.t0 and run.starts_singular  # there, the user gave v: rounding has not changed it
+        at_singular_start = t == run.t0 and run.starts_singular  # v is given by the user, not changed by rounding
         if t >= end or at_singular_start or certainly_exceed(run.near_threshold, system.rows(t, q), run.rank):
             continue
         error_ratio = _velocity_error_ratio(run, t, q, v)
@@ -279,7 +279,7 @@ def describe_rounding(run: "Run", states: list[TimedState], end: float) -> str:
 
 
 def describe_arrival(t: float, fixed: bool) -> str:
-    """Return the first sentence of the message of a run that reached its end; `fixed`: if step sizes were constant."""
+    """Return the first sentence of the message of a run that reached its end; `fixed`: whether all steps were equal."""
     return f"Reached the end, t = {t:g}{', with a constant step: no error was estimated' if fixed else ''}."
 
 
@@ -372,7 +372,7 @@ def _describe_stall(run: "Run", t1: float, stall: StallDetector) -> str:
 
 
 def _describe_contradiction(run: "Run") -> str:
-    """Return the message of a run that stopped: a redundant row is violated, or the branch at the start is unknown."""
+    """Return the message of a run that violates a redundant row, or whose branch at a singular start is unknown."""
     t, q = float(run.clock[run.a.T]), run.state[: run.system.n_q]
     if run.starts_singular:
         return (
@@ -475,7 +475,7 @@ def _describe_near_singular(run: "Run", t1: float) -> str:
 
 
 def describe_not_finite(run: "Run") -> str:
-    """Return a phrase that names the callback whose value is not finite, or says where callbacks are not finite."""
+    """Return a phrase that names the callback whose value is not finite, or, if none is found, the possible cause."""
     kind, fault_time = int(run.work.notes[indices.FAULT_KIND]), float(run.work.notes[indices.FAULT_TIME])
     if kind >= 0:
         name = run.kit.functions._fields[kind]

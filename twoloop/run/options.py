@@ -39,7 +39,7 @@ class Options:
 
     @cached_property
     def key(self) -> object:
-        """Key in caches of integrators: the same object for equal options."""
+        """Key of the options in caches of integrators; equal options have the same object as key."""
         step_options = self.first_step, self.max_step, self.max_steps, self.step_size
         tolerances = self.rtol, self.atol.tobytes()
         return _unique_key(identity(self.method), *tolerances, *step_options, self.compiled, self.check_derivatives)
@@ -51,18 +51,18 @@ class Options:
 
     @cached_property
     def metadata(self) -> dict[str, Any]:
-        """Fields `method` and `rtol` of a result; if all steps test the errors of v, also `untested`, which is None."""
+        """Fields `method` and `rtol` of a result; also `untested` = None (no step) if steps test velocity errors."""
         tested = getattr(self.method, "tested", "all")
         return {"method": self.method.name, "rtol": self.rtol} | ({} if tested == "positions" else {"untested": None})
 
     def set_step_sizes(self, run: Run, t1: float) -> None:
         """Set the first step size and the limits of step sizes (s) of a run that ends at t1, unless steps are fixed."""
-        run.work.notes[indices.NEXT_JUMP] = t1  # no jump of velocities before t1 is known yet
+        run.work.notes[indices.NEXT_JUMP] = t1  # time of the next jump of C_t or b; t1 as long as none is known
         if self.step_size is None:
             run.set_step_sizes(self.first_step, self.max_step, t1)
 
 
-NO_CALL: Any = (None,) * 12, None  # before the first call, in place of (12 arguments, options) of the last call
+NO_CALL: Any = (None,) * 12, None  # (12 arguments, options) of the last call, as long as there was none
 
 
 def options_of(

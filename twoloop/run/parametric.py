@@ -114,7 +114,7 @@ class ParametricRun:
             traced.is_trusted = False
 
     def callbacks_agree(self, t0: float, q: Array, v: Array, t1: float, mass: Array, with_derivatives: bool) -> bool:
-        """Return whether callbacks agree with traces near the start, and M has the same structure as before.
+        """Return whether callbacks agree with traces near the start, and M has the structure that `shared` requires.
 
         The structure of M (`mass`: M at the start) is whether M is definite, and whether M is diagonal.
         """
@@ -132,7 +132,7 @@ class ParametricRun:
         return self._mass_agrees
 
     def _replace_arrays(self, plan: Plan) -> Plan:
-        """Return a copy of a plan with arrays of numbers, for the current parameters, instead of expressions."""
+        """Return a copy of a plan in which numbers, for the current parameters, replace expressions."""
         array, values = self._expression_arrays.array, vars(plan)
         changes: dict[str, Any] = {name: array(values[name]) for name in NUMBER_FIELDS if values[name] is not None}
         changes |= {name: self._replace_arrays(values[name]) for name in PLAN_FIELDS if values[name] is not None}

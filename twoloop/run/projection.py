@@ -66,8 +66,8 @@ class _SparseProjection:
     def project_nearby(self, q: Array) -> Array | None:
         """Return q projected onto the independent constraints; None on failure, or if other constraints are violated.
 
-        Which rows of C_q are independent is known from the last RENEW_PARTITION, at a consistent position: away from
-        the constraints, redundant rows are not quite dependent.
+        The independent rows of C_q are those that the last task RENEW_PARTITION found at a consistent position: at
+        other positions, redundant rows are not quite dependent.
         """
         zero, change = np.zeros(len(q)), np.zeros(len(q))
         for _ in range(MAX_CORRECTIONS):
@@ -88,7 +88,7 @@ class _SparseProjection:
         if self.run_task(tasks.RESTORE, q, discarded) != indices.DONE:
             return None
         v = v.copy()  # until the positions are final, only a copy of the velocities is projected
-        for task in (tasks.RESTORE, tasks.RESTORE, tasks.FIND_NULL_SPACE):  # two RESTORE: down to rounding errors
+        for task in (tasks.RESTORE, tasks.RESTORE, tasks.FIND_NULL_SPACE):  # RESTORE runs twice, for higher accuracy
             if self.run_task(task, q, v) != indices.DONE:
                 return None
         self.position = q
@@ -134,7 +134,7 @@ def dependence(system: ConstrainedSystem, t: float, q: Array) -> Dependence | No
 def project_sparsely(
     system: ConstrainedSystem, t: float, q: Array, v: Array, check_assembly: bool
 ) -> tuple[Array, Array] | None:
-    """Return (q, v) projected by sparse factors; None on failure, or if another assembly may be as near."""
+    """Return (q, v) projected by sparse factors; None on failure, or if nearby guesses may end on another assembly."""
     form = fixed_order_form(system, t, q)
     if form is None:
         return None
@@ -148,7 +148,7 @@ def project_sparsely(
     projected = projection.project(q, v)
     if projected is None or projection.work.notes[indices.PIVOT] < MIN_SINE:
         return None
-    # rows that are independent at the guess must also be independent at the projected position
+    # give up if rows that are independent at the guess are not independent at the projected position
     projection_there = _SparseProjection(system, t, projected[0], form, projection.rank)
     if projection_there.run_task(tasks.RENEW_PARTITION, projected[0].copy(), v.copy()) != indices.DONE:
         return None
@@ -166,8 +166,8 @@ def project_sparsely(
 def _nearby_guesses_match(projection: _SparseProjection, position: Array, change: Array) -> bool:
     """Return whether three guesses near a projected `position` lead to the same assembly as the user's guess.
 
-    `change`: displacement of the user's guess by its projection. The three guesses are displaced from `position` by -2
-    `change`, and by two random vectors of at most max|change|. A guess leads to the same assembly if the linearized
+    `change`: displacement of the user's guess by its projection. The three guesses are displaced from `position` by
+    -2 * change, and by two random vectors of at most max|change|. A guess leads to the same assembly if the linearized
     constraints predict where it is projected.
     """
     distance = float(np.abs(change).max())
@@ -184,14 +184,14 @@ def _nearby_guesses_match(projection: _SparseProjection, position: Array, change
 
 
 MAX_ITERATIONS = 50  # largest number of Gauss-Newton iterations
-# the iteration ends if violation / (violation allowed at a start) is at most this, and the last step has not halved it
+# the iteration ends if violation / allowed violation is at most this, and the last step has not halved the violation
 CONVERGED_VIOLATION = 1e-2
 # singular values of C_q count as zero below these fractions of the largest one. RANK_CUTOFF: for ranks. LSTSQ_CUTOFF:
 # for least-squares solutions. REDUNDANT_CUTOFF: for least-squares solutions with redundant rows
 RANK_CUTOFF, LSTSQ_CUTOFF, REDUNDANT_CUTOFF = 1e-10, 1e-13, 1e-2
 # a dead centre is near if the ratio of the smallest to the largest singular value of C_q is at most this
 DEAD_CENTRE_RATIO = 0.01
-MAX_EQUAL_DISTANCE = 0.1  # two projected guesses are equal if distance / (largest change by projection) is at most this
+MAX_EQUAL_DISTANCE = 0.1  # projected guesses are equal if their distance / (largest change by projection) is below this
 MAX_CHANGE = 1e8  # the iteration has diverged if a coordinate changes by more than this, in its unit (`Scales.columns`)
 
 
@@ -320,7 +320,7 @@ def _project_state(
 
 
 class _LargeState(ConsistentState):
-    """Consistent state of a large system; its assembly is computed when read, because this takes full matrices."""
+    """Consistent state of a large system; its assembly is computed only when read, as that needs full matrices."""
 
     system: ConstrainedSystem
     t: float
@@ -340,7 +340,7 @@ def _projected_position(
 ) -> Array:
     """Return a guess projected by changes of its `free` coordinates; raise ValueError on failure.
 
-    If `check_assembly`, the projection also fails if another assembly may be as near as the projected position.
+    If `check_assembly`, also raise ValueError if another assembly may be as near to the guess as the result.
     """
     jacobian = system.jacobian(t, guess)
     scales = scales_of(system, t, guess, jacobian)
@@ -352,7 +352,7 @@ def _projected_position(
     position, excess, iterations = _gauss_newton(system, t, guess, free)
     has_redundant_rows = position is None or _rank(scales.scaled(system.jacobian(t, position))) < system.n_c
     cutoff = REDUNDANT_CUTOFF if has_redundant_rows else LSTSQ_CUTOFF
-    if has_redundant_rows:  # repeat with the larger cutoff: off the constraints, these rows are nearly dependent
+    if has_redundant_rows:  # use a larger cutoff: off the constraints, redundant rows are only nearly dependent
         position, excess, iterations = _gauss_newton(system, t, guess, free, cutoff)
     if position is None or not excess <= 1.0:
         has_diverged = position is None
@@ -384,10 +384,10 @@ def _describe_other_assembly(
 ) -> str | None:
     """Check whether guesses as far from the projected position q1 as `guess` may lead to another assembly.
 
-    Return None if no guess may, else a phrase on a guess that may. A guess leads to the same assembly if projected to
-    about the point that C_q predicts to first order, and the determinant of the dependent columns keeps its sign.
-    Else, Newton's method starts from the independent coordinates of q1 and the dependent ones of the projected guess:
-    if it does not lead back to q1, there is another assembly.
+    Return None if they cannot, or a phrase about one that may. A guess leads to the same assembly if its projection is
+    about the point that C_q predicts to first order, and the determinant of the dependent columns keeps its sign. If
+    not, Newton's method starts from the independent coordinates of q1 and the dependent ones of the projected guess. If
+    this iteration does not lead back to q1, there is another assembly.
     """
     scaled_move = (q1 - guess) / scales.columns
     largest_move = float(np.abs(scaled_move).max())
@@ -411,8 +411,8 @@ def _describe_other_assembly(
         expected = q1 + displacement + _least_change(jacobian, free, -(jacobian @ displacement), cutoff)
         if distance(projected, expected) <= MAX_NONLINEARITY * float(np.abs(move).max()) and sign_at(projected) == sign:
             continue
-        # the prediction may be inaccurate only because constraints are curved. Then q1 with the dependent coordinates
-        # of `projected` is projected back to q1; otherwise, `projected` is on another assembly
+        # the prediction may be inaccurate only because constraints are curved. Then `mixed`, q1 with the dependent
+        # coordinates of `projected`, is projected back to q1. Otherwise, `projected` is on another assembly
         mixed = q1.copy()
         mixed[dependent_columns] = projected[dependent_columns]
         mixed_projected, excess, _ = _gauss_newton(system, t, mixed, np.array(dependent_columns, dtype=int), cutoff)
@@ -436,7 +436,7 @@ def _gauss_newton(
 ) -> tuple[Array | None, float, int]:
     """Change the `free` entries of q until it is consistent, by the Gauss-Newton method.
 
-    Return q (None: diverged), (violation / allowed violation) of q, and the number of iterations.
+    Return q (None if the iteration diverges), violation / allowed violation of q, and the number of iterations.
     """
     least_excess, best_q, guess = np.inf, q, q
     for iteration in range(1, MAX_ITERATIONS + 1):
@@ -516,7 +516,7 @@ def _describe_rank_loss(scales: Scales, jacobian: Array, free: NDArray[np.intp],
 def _describe_no_freedom(
     system: ConstrainedSystem, t: float, scaled: Array, free: NDArray[np.intp], kept: list[int], why: str
 ) -> str:
-    """Return the message for a projection that fails because the columns of C_q for `free` coordinates lack rank."""
+    """Return the message of a projection that fails because columns of C_q lack rank; `why`: what remains violated."""
     ranks = f"rank {_rank(scaled[:, free])} of {len(scaled)}"
     name = "C_q" if len(scaled) == system.n_c else "[C_q; A], whose rows contradict one another at these velocities,"
     if not kept:

@@ -116,14 +116,14 @@ def read_arrays(folder: Path) -> dict[str, NDArray[Any]]:
 
 Array = NDArray[np.float64]
 
-MAX_PENDING_STATES = 1024  # when more states than this are pending, search intervals for events and output times
+MAX_PENDING_STATES = 1024  # number of states that may wait until intervals are searched for events and output times
 
 
 class OutputRequest(NamedTuple):
     """Requested output of a run."""
 
     times: Array | None = None  # output times; None: the ends of all accepted steps
-    ends_at_outputs: bool = False  # whether steps end at all output times; if not, states at these are interpolated
+    ends_at_outputs: bool = False  # whether steps end at all output times; if not, states are interpolated
     dense: bool = False  # whether dense output, `result.sol`, is requested
     events: list[Event] | None = None  # events to be searched for; None: no events were requested
     store: Any = None  # `MemoryStore` or `FileStore` to which the output is added; None: a new MemoryStore
@@ -164,10 +164,10 @@ class Recorder:
         self.n_steps = 0  # number of steps searched for events so far; the last step may contain a terminal event
         self.last_step_size = 0.0  # time (s) from the beginning of the run's last step to the terminal event
         self.interrupted = False  # whether Ctrl-C interrupted the search for events, or the interpolation
-        # pending states: ends of intervals not searched for events yet, and earlier states on the same polynomials
+        # pending states: ends of intervals not searched for events yet, and earlier states for their interpolation
         self._t, self._rows = np.array([t0]), state[None, :].copy()
         self._kinds = np.empty(0, dtype=np.int64)
-        self._next_interval = 0  # index in `_kinds` of the first interval that is not searched yet
+        self._next_interval = 0  # index in `_kinds` of the first interval that is not searched for events yet
         self._n_outputs = 0
         may_end_run = request.events is not None and any(event.terminal < np.inf for event in request.events)
         self._max_pending = 0 if may_end_run or request.store.append_only else MAX_PENDING_STATES
@@ -195,7 +195,7 @@ class Recorder:
             self._rows[-1, : len(row)] = row
 
     def store_crossing(self, memory: Array) -> None:
-        """If a crossing step's `memory` contains a polynomial, copy `memory` for the interval after the last state."""
+        """If a crossing step from the last state stored a polynomial in `memory`, copy `memory` for dense output."""
         from twoloop.kernels.steps.crossing_step import END, N_STORED
 
         if self.interpolator is not None and memory[-N_STORED:][END] > -np.inf:
@@ -206,7 +206,7 @@ class Recorder:
         request, store = self.request, self.request.store
         if request.times is None:
             self._store_states(t, rows)
-        elif request.ends_at_outputs:  # steps may also end at other times, such as the end of the run
+        elif request.ends_at_outputs:  # steps may also end at times that are not output times
             is_output = np.append(request.times, np.inf)[np.searchsorted(request.times, t)] == t
             self._store_states(t[is_output], rows[is_output])
         if request.dense:
@@ -221,7 +221,7 @@ class Recorder:
 
     @property
     def end_state(self) -> tuple[float, Array] | None:
-        """Time and row [q, v] of the event that ended the run, or None."""
+        """Time and row [q, v] of the event that ended the run; None if no event ended it."""
         return (
             None if self.search is None or self.end_event is None else self.search.found[self.end_event[0].number][-1]
         )
@@ -234,7 +234,7 @@ class Recorder:
 
     @property
     def end_event(self) -> tuple[Event, float] | None:
-        """Event that ended the run, and its time, or None."""
+        """Event that ended the run, and its time; None if no event ended it."""
         return None if self.search is None else self.search.ended
 
     def search_intervals(self, end: int | None = None) -> None:
@@ -307,7 +307,7 @@ class Recorder:
         return DenseSolution(self.interpolator, table, end if self.end_event is None else self.end_event[1])
 
     def events(self) -> tuple[list[Array], list[Array], list[Array]] | tuple[None, None, None]:
-        """Return times, coordinates and velocities of the events: three lists with one array per event function."""
+        """Return times, coordinates, velocities: lists of one array per event function, all None without functions."""
         if self.search is None:
             return None, None, None
         n = self._n_q
@@ -496,7 +496,7 @@ class Record:
 
 
 def record_of(kind: type[AnyRecord], fields: dict[str, Any]) -> AnyRecord:
-    """Return a record with the attributes `fields`. The constructor of this large frozen dataclass would be slower."""
+    """Return a record of the class `kind` with the attributes `fields`; the constructor of the class is slower."""
     instance = _new_object(kind)
     _set_fields(instance, fields)
     return instance
@@ -506,7 +506,7 @@ _new_object, _set_fields = object.__new__, vars(Record)["__dict__"].__set__
 
 
 class _Deferred:
-    """Descriptor of a field of a record: when a missing value is first read, compute it by `vars(record)["later"]`."""
+    """Descriptor of a record's field: the function `vars(record)["later"]` computes a missing value when first read."""
 
     def __init__(self, name: str):
         self.name = name
@@ -520,7 +520,7 @@ class _Deferred:
 
 
 DEFAULTS = {each.name: each.default for each in fields(Record) if each.default is not MISSING}
-for _field in fields(Record):  # after the class: within the class, `dataclass` would take descriptors for defaults
+for _field in fields(Record):  # not within the class, where `dataclass` would take descriptors for default values
     setattr(Record, _field.name, _Deferred(_field.name))
 
 

@@ -88,10 +88,10 @@ def check_callbacks_along_run(
 
 
 def _check_derivatives(run: Run, states: Array, first_state: Array, status: Status, message: str) -> tuple[Status, str]:
-    """Compare derivatives with exact ones, or finite differences, at states of a run; return a status and a message.
+    """Compare callbacks for derivatives with exact derivatives or finite differences; return a status and a message.
 
-    M, `kinematics` and callbacks for entries of sparse matrices are checked, too. If all are right, return `status` and
-    `message`; else WRONG_DERIVATIVE and a message with the mistake. `first_state`: first state [t, q, v] of the run.
+    M, `kinematics` and callbacks for entries of sparse matrices are checked, too. Without a mistake, return `status`
+    and `message`; else WRONG_DERIVATIVE and a message with the mistake. `first_state`: first [t, q, v] of the run.
     """
     n = run.system.n_q
     chosen_states = states[:: 1 + (len(states) - 1) // N_DERIVATIVES][::-1]
@@ -136,7 +136,7 @@ def python_functions(system: ConstrainedSystem) -> PythonFunctions | None:
 def first_force(system: ConstrainedSystem, t0: float, q0: Array, v0: Array) -> tuple[Any, Array] | None:
     """Return ((t0, q0, v0), value of the compiled force) for `describe_changed_force`; None if the force fails.
 
-    If the force is a Python function, return None, and delete the samples of its calls, which serve for the same check.
+    If callbacks are called in Python, return None: the run records calls of the force. Delete records of earlier runs.
     """
     if functions := python_functions(system):
         functions.restart()
@@ -147,7 +147,7 @@ def first_force(system: ConstrainedSystem, t0: float, q0: Array, v0: Array) -> t
 
 
 def describe_changed_force(run: Run) -> str | None:
-    """After a run, call the force with the same arguments as before or in the run; describe a difference, else None.
+    """Repeat calls of the force that were recorded before or in a run; describe a changed value, or return None.
 
     Two calls after the run would not reveal a force that changes slowly (with the clock) or once (after 1000 calls).
     """
@@ -223,7 +223,7 @@ class IndependentRerun:
         a, control = self.run.a, self.run.control
         control[a.MAX_STEP], control[a.MAY_CROSS], control[a.STORE_ALL] = max_step, 0.0, 0.0
         control[a.MAX_ATTEMPTS] = CHUNK_ATTEMPTS
-        self.run.work.notes[indices.GAMMA_REQUIRED] = np.inf  # no test of gamma: the checked run has tested it
+        self.run.work.notes[indices.GAMMA_REQUIRED] = np.inf  # any error of gamma is allowed: the checked run tested it
         n_rows = max(2, min(CHUNK_ATTEMPTS, MAX_BUFFER_SIZE // len(self.run.state)))
         rows = (np.empty(n_rows), np.empty((n_rows, len(self.run.state))))
         self.buffers, self.n_filled = (*rows, np.empty((CHUNK_ATTEMPTS, a.N_STEP_COLUMNS))), np.zeros(2, dtype=np.int64)

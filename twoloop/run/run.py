@@ -38,21 +38,21 @@ from twoloop.run.singular_positions import (
 from twoloop.run.workspace import add_newton_program, fixed_order_form, kit_for_plan, make_kit, workspace
 
 Array = NDArray[np.float64]
-Buffers = tuple[Array, Array, Array]  # times, states and steps
+Buffers = tuple[Array, Array, Array]  # arrays of times, states and records of steps
 
 # largest number of attempted steps in the first chunk (call of compiled code) of a small system. Each chunk is followed
 # by checks in Python, which take 0.2 ms: much compared with the time of a shorter chunk
 FIRST_CHUNK = 1024
 FIRST_CHUNK_IN_PYTHON = 64  # largest number of steps in the first chunk if callbacks are (slow) Python functions
 SMALL_SYSTEM = 32  # largest number of coordinates of a small system; chunks of larger ones are proportionally smaller
-TRIAL_STEPS = 10  # a method that is fast only with long steps is replaced if one of this many first steps is short
-NO_PATTERN = np.zeros((0, 0))  # empty pattern of constraint rows, for the fixed-order form, which has its own
-# constraints contradict each other if accelerations a violate a row of C_q a = gamma by more than this * sum of |terms|
+TRIAL_STEPS = 10  # a method on trial is given up if one of this many first steps is short, see loop_state.TRIAL_STEPS
+NO_PATTERN = np.zeros((0, 0))  # empty argument `pattern` for the fixed-order form, which stores the pattern itself
+# constraints contradict one another if a row of G a = Gamma is violated by more than this * max(sum of |terms|, 1)
 CONTRADICTION = 1e-6
 
 
 class Run:
-    """Data of an integration: plan (method), kit, workspace, state and controls. A new Run is at its start.
+    """Data of an integration: plan, kit, workspace, state and settings. A new Run is at its start.
 
     Raise ValueError if accelerations at the start cannot be computed, or if constraints contradict one another.
     """
@@ -104,7 +104,7 @@ class Run:
         self._reset_clock(t0)
         self.write_step_control(plan)
         self.substituted = False  # whether `plan.substitute` has replaced the first plan
-        self.near_threshold = singular_threshold(rtol)  # (smallest / largest pivot) is lower near a singular position
+        self.near_threshold = singular_threshold(rtol)  # near a singular position, min pivot / max pivot is below this
         force_traced = any("force" in each.kinds for each in plan.traced)
         short_and_steep = system.remembered(
             ("changes", force_traced),
@@ -114,22 +114,22 @@ class Run:
         self.short_forces: ShortForces = short_forces
         self.control[[loop_state.BY_TIME, loop_state.BY_STATE]] = self.short_forces
         self.forces_may_be_steep = steep or plan.max_gap == 1.0
-        self.crossings: list[list[tuple[float, Array]]] = []  # states before and after steps across singular positions
+        self.crossings: list[list[tuple[float, Array]]] = []  # for each crossing, (t, state) before it and after it
         # the next seven attributes belong to steps across a singular position, see fallbacks.py
-        self.mirrored_size = 0.0  # size (s) of a step from before a singular position to as far beyond it
+        self.mirrored_size = 0.0  # size (s) of a step that begins as far before a singular position as it ends beyond
         self.crossing_tolerances = self.tolerances  # tolerances of steps across singular positions
         self.sizes_to_try: list[float] = []  # step sizes (s) still to be tried across a singular position
         self.attempts_left = np.inf  # the search for a step across a singular position ends after so many failures
         self.crossing_size = 0.0  # size (s) of the last attempted step across a singular position
-        self.piece_ends: list[float] = []  # ends (s) of next steps on a polynomial across a singular position
-        self.origins: list[Any] = []  # `Origin` of each polynomial still to be tried across a singular position
+        self.piece_ends: list[float] = []  # end times (s) of next steps along a polynomial across a singular position
+        self.origins: list[Any] = []  # `Origin` (begin, limits) of each polynomial still to be tried for a crossing
         self.t1 = np.inf  # end of the run (s)
         self.starts_singular = False  # whether the start is a singular position: C_q has a higher rank beside it
         self.branch_known = False  # whether it is known on which branch the motion leaves a singular start
         self.jumps: list[float] = []  # times (s) at which velocities jumped because C_t, or b in A v + b = 0, jumped
-        self.compared_until = [-np.inf]  # time until which callbacks were compared with traces; copies share the list
+        self.compared_until = [-np.inf]  # latest time (s) of a comparison with traces; copies of the run share the list
         self.region: CheckedRegion | None = None  # where callbacks agreed with traces; None: the system's region
-        self.varied_parameters: Array | None = None  # parameters in which systems that share this run differ
+        self.varied_parameters: Array | None = None  # parameter values now, if systems share this run; None: one system
         self._compute_start_accelerations()
         self.rank = len(self.work.rows_v)
         self.descriptions: dict[tuple[int, ...], str] = {}  # cached warnings; the keys are indices of redundant rows
@@ -143,7 +143,7 @@ class Run:
         return new_run
 
     def copy_to_start(self, t0: float, q0: Array, v0: Array) -> "Run | None":
-        """Return a copy of this run at another start; None if ranks differ, or accelerations cannot be computed.
+        """Return a copy of this run at another start; None if ranks differ from this run's, or accelerations fail.
 
         The run must not use the fixed-order form (sparse factors in a fixed order of elimination).
         """
@@ -166,7 +166,7 @@ class Run:
         return code
 
     def move_to_singular_start(self, t: float, q: Array, v: Array, a: Array, first_size: float) -> None:
-        """Move the start of a run into the singular position beside it; `first_size`: size (s) of the first step."""
+        """Begin the run in the singular position beside its start; `first_size`: size (s) of the first step."""
         n, clock = self.system.n_q, self.clock
         self.t0, self.starts_singular, self.branch_known = t, True, True
         self.state[:n], self.state[n : 2 * n], self.state[2 * n : 3 * n], self.state[3 * n :] = q, v, a, np.nan
@@ -287,7 +287,7 @@ class Run:
         if code == indices.RANK_DIFFERS:  # keep the rank at the start of the run, even if the rank is higher now
             self.work.notes[indices.GENERATION] = 1.0
             code = entry_point(self.kernels.start)(self.kit, self.work, t, state)
-        if old_work.notes[indices.PIVOT] > 0.0 and largest_pivot > 0.0:  # pivots have another scale now
+        if old_work.notes[indices.PIVOT] > 0.0 and largest_pivot > 0.0:  # pivots of the new form have another scale
             pivot = self.work.notes[indices.PIVOT]
             self.clock[self.a.LARGEST_PIVOT] = pivot * max(1.0, largest_pivot / old_work.notes[indices.PIVOT])
 
@@ -300,7 +300,7 @@ class Run:
             self.work = self._make_workspace(rank, rank)
             code = start(self.kit, self.work, self.t0, self.state)
         if self.fixed_order is not None and code not in (indices.DONE, indices.NOT_FINITE):
-            if self.work.notes[indices.SMALLEST] < 0.0:  # M is not definite: later runs must not try this form again
+            if self.work.notes[indices.SMALLEST] < 0.0:  # M is not definite: no fixed-order form in later runs
                 self.system.derived["fixed-order form"] = None
             self.fixed_order = None
             self.kit = make_kit(self.system, self.t0, self.state[: self.system.n_q], self.plan)
@@ -336,7 +336,7 @@ class Run:
         )
 
     def find_redundant_rows(self) -> tuple[NDArray[np.int64], str]:
-        """Return the indices of redundant constraint rows at the start, and a warning; raise if a row is violated."""
+        """Return indices of redundant rows at the start and a warning; raise ValueError for contradictory rows."""
         n_rows = self.system.n_c + self.system.n_a
         if self.rank == n_rows:
             return np.zeros(0, dtype=np.int64), ""
@@ -373,7 +373,7 @@ class Run:
         n = self.system.n_q
         a, gamma = self.state[2 * n : 3 * n], self.work.Gamma
         residual = np.abs(rows @ a - gamma)
-        if residual.max() <= CONTRADICTION:  # below the limits of all rows, which are at least CONTRADICTION
+        if residual.max() <= CONTRADICTION:  # no row is violated: the limit of each row is at least CONTRADICTION
             return np.zeros(0, dtype=np.int64)
         return np.flatnonzero(residual > CONTRADICTION * np.maximum(abs(rows) @ np.abs(a) + np.abs(gamma), 1.0))
 
@@ -401,14 +401,15 @@ class Run:
     def limit_steps(self) -> None:
         """Limit step sizes so that forces are evaluated at least every hundredth of the run, to detect short forces.
 
-        If forces may be steep, a single evaluation may not detect a short one: then this time also limits step sizes.
+        If forces may be steep, steps are at most a hundredth of the run, unless the method evaluates forces within its
+        steps: one evaluation alone may not detect a short force.
         """
         gap = 1.0 if self.forces_may_be_steep else self.plan.max_gap
         max_size = np.inf if self.plan.evaluates_within else self.tolerances[indices.GAP] / gap
         self.control[self.a.MAX_STEP], self.control[self.a.MAX_EVALUATION_GAP] = min(self.max_step, max_size), gap
 
     def choose_first_step(self, t: float, t1: float, state: Array, longest: float = 0.0) -> float:
-        """Return the size (s) of the first step from a state; if `longest` (max_step) > 0, set limits of step sizes."""
+        """Return the size (s) of the first step from a state; if `longest` > 0 (max_step), store limits of sizes."""
         numbers = self.system.n_q, t, t1, self.least_atol, longest, self.plan.evaluates_within
         size: float = entry_point(cached_run().first_step_and_limits)(self.control, self.tolerances, state, *numbers)
         return size

@@ -35,7 +35,7 @@ Array = NDArray[np.float64]
 
 MAX_ATTEMPTS = 1024  # after this many attempted integration steps in one sample, `IntegrationLoop` takes over
 FORCE_KINDS = {"force", "force_by_q", "force_by_v"}  # parameters that change may enter these callbacks only
-CHANGED_PARAMETERS = "the parameters changed at samples"  # value of the field `changes` of results of SampledRun
+CHANGED_PARAMETERS = "the parameters changed at samples"  # `changes` in each Result of a SampledRun
 
 
 class SampledState(NamedTuple):
@@ -99,7 +99,7 @@ class SampledRun:
         if self.run.start_warning:
             warn_user(self.run.start_warning)
         self.p = system.functions.p[system.called_in_python :]
-        self._force_parameters: set[int] = set()  # indices of parameters that, as checked, affect forces only
+        self._force_parameters: set[int] = set()  # indices of parameters that, according to checks, enter forces only
         self._parameters_changed = self._step_failed = False
         self._outputs, self._filled = np.zeros(1), np.zeros(2, dtype=np.int64)
         self._buffers = (
@@ -108,7 +108,7 @@ class SampledRun:
             np.empty((MAX_ATTEMPTS, self.run.a.N_STEP_COLUMNS)),
         )
         self.rows, self.times, self.steps = list[Array](), list[float](), list[Array]()
-        self.cpu_time, self._max_gap = 0.0, np.inf  # CPU time (s); largest time (s) between force evaluations
+        self.cpu_time, self._max_gap = 0.0, np.inf  # CPU time (s); longest allowed time (s) between samples of forces
         self._store_sample(t0)
 
     def _create_run(self, t: float, q: Array, v: Array) -> Run:
@@ -121,7 +121,7 @@ class SampledRun:
                 f"have lost rank there ({dependent_rows(self._derived_system, t, q)}), but not beside it. Start a "
                 "little before that position, or beyond; run and solve_dae may start there"
             )
-        run.work.notes[indices.GENERATION] = 1.0  # number of partitions so far; above 0, kernels keep known ranks
+        run.work.notes[indices.GENERATION] = 1.0  # as if a partition had been chosen: ranks are known
         run.set_step_sizes(None, self.max_step, t + 1.0)
         run.control[run.a.STORE_ALL] = 0.0
         return run
@@ -168,12 +168,12 @@ class SampledRun:
         return self.state
 
     def _step_to(self, end: float) -> None:
-        """Integrate to the time `end`; repeat with more evaluations of forces if short changes may have been missed."""
+        """Integrate to the time `end`; if short changes may have been missed, integrate again with denser samples."""
         for _ in range(MAX_REPETITIONS):
             self._integrate_to(end)
             if not may_have_missed_changes(self.run):
                 return
-            if len(self.times) > 1:  # earlier calls of `step`, not repeated, may also have missed short changes: warn
+            if len(self.times) > 1:  # earlier calls, which are not repeated, may have missed short changes, too
                 warn_of_missed_changes(self.run)
             self._max_gap = gap_for_repetition(self.run)
             self._return_to_sample()
@@ -231,7 +231,7 @@ class SampledRun:
         run, a = self.run, self.run.a
         code = entry_point(run.kernels.start)(run.kit, run.work, t, run.state)
         n_not_reset = 0
-        if run.plan.first is not None:  # a pair of methods: keep the numbers that choose between these
+        if run.plan.first is not None:  # keep the numbers by which a pair of methods switches
             from twoloop.kernels.control.stiffness import N_SCALARS
 
             n_not_reset = N_SCALARS + 2 * run.system.n_q

@@ -62,7 +62,7 @@ class SignalHandlers:
     def call_delayed(self) -> None:
         """Call the handlers whose calls were delayed; if a handler has raised an exception, raise it again."""
         while self._delayed_calls and self._handler_error is None:
-            # pass the present frame: for the signal's frame, in a compiler, other SignalHandlers would delay the call
+            # do not pass the signal's frame: it is in a compiler, so outer SignalHandlers would delay the call again
             self._call_handler(self._delayed_calls.pop(0), sys._getframe())
         if self._handler_error is not None:  # not reset here: `restore` raises it again if the caller catches it
             raise self._handler_error from None
@@ -84,7 +84,7 @@ class SignalHandlers:
 
 
 def signals_of(system: ConstrainedSystem) -> SignalHandlers:
-    """Return a context for code that catches exceptions of callbacks, so that those of signal handlers are not lost."""
+    """Return a context manager for a block that catches exceptions: those of signal handlers are raised at its end."""
     return SignalHandlers(ctrl_c=system.called_in_python)
 
 

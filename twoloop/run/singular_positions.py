@@ -1,8 +1,8 @@
 """Describe singular positions: where steps crossed them, and how uncertain the motion is near them.
 
 "Rows" are the rows of the constraint Jacobian: C_q, then A of the non-holonomic constraints A v + b = 0. Let s be the
-smallest singular value of this matrix, and d its right singular vector. Constraints with rounding errors eps determine
-q along d only to eps / s. This error of q changes the rows: so velocities along d have errors of about eps / s^2.
+smallest singular value of this matrix, and d its right singular vector. If constraints have rounding errors eps,
+q along d has errors of about eps / s. These change the rows, so that velocities along d have errors of about eps / s^2.
 """
 
 from collections.abc import Callable, Iterator
@@ -27,7 +27,7 @@ N_POSITIONS = 33  # the least singular value between two states is searched for 
 MAX_SHOWN = 3  # largest number of singular positions in a message
 # displacement of q in finite differences of constraint equations and their Jacobian, relative to the largest coordinate
 DISPLACEMENT = 1e-6
-# each row of the Jacobian is divided by its norm. But a row that is small at this position only is divided by
+# each row of the Jacobian is divided by its norm. But if a row is small only at this position, it is divided by
 # MIN_ROW_NORM times the norm that the row has nearby (estimated from the row's derivative)
 MIN_ROW_NORM = 0.1
 # velocities jumped in a step if their change exceeds both JUMP_RATIO * step size * acceleration and MIN_JUMP tolerances
@@ -139,7 +139,7 @@ def has_velocity_jump_at_end(times: Array, rows: Array, n: int) -> bool:
 
 
 def _crossing_ends(crossings: Crossings, end_state: TimedState) -> Iterator[tuple[TimedState, TimedState, bool]]:
-    """Yield (state before, state after, whether the position was crossed by special steps) for each position."""
+    """Yield, for each position, the states before and after it, and whether a crossing was completed in between."""
     before: TimedState | None = None
     for first, *after in crossings:
         before = first if before is None else before
@@ -166,8 +166,8 @@ def _largest_acceleration(system: ConstrainedSystem, t: float, q: Array, v: Arra
 def scaled_to_unit_masses(system: ConstrainedSystem, t: float, q: Array) -> tuple[Array, Array, Array, Array]:
     """Return M and the constraint Jacobian, both scaled, the divisors of rows, and the units of coordinates.
 
-    q_j is scaled as q_j / unit_j with unit_j = 1 / sqrt(M_jj), so that the diagonal entries of M become 1. With the
-    divisors, all rows of the Jacobian have the norm 1, except for rows that are small at this position only.
+    q_j is scaled as q_j / unit_j with unit_j = 1 / sqrt(M_jj), so that the diagonal entries of M become 1. After
+    division by the divisors, rows of the Jacobian have the norm 1, unless they are small only at this position.
     """
     mass, rows = system.mass(t, q), system.rows(t, q)
     inertia = np.abs(np.diagonal(mass))
@@ -225,7 +225,7 @@ def velocity_rounding_errors(system: ConstrainedSystem, t: float, q: Array, v: A
             row_slopes = np.abs(np.subtract(*(system.rows(t, each) for each in displaced)))
         except (ArithmeticError, ValueError):  # a square root, for example, fails beyond a dead centre
             return np.full(len(q), np.nan)
-        # rounding errors of constraints: rounding errors of q times Jacobian entries near q (at q, some may be small)
+        # rounding errors of constraints are those of q times Jacobian entries nearby, because entries at q may be small
         nearby_rows = np.abs(rows) + (row_slopes * (np.abs(rows).max() / row_slopes.max()) if row_slopes.any() else 0.0)
         rounding = ROUNDING * np.sqrt((nearby_rows * nearby_rows) @ (q * q))
         errors = np.maximum(
@@ -235,7 +235,7 @@ def velocity_rounding_errors(system: ConstrainedSystem, t: float, q: Array, v: A
 
 
 def describe_singular_start(system: ConstrainedSystem, t: float, q: Array, rank: int, rtol: float, atol: Array) -> str:
-    """Return a warning if a singular position may be within tolerances of the start q, else ""; `rank`: of [C_q; A]."""
+    """Return a warning if a singular position may be within tolerances of q, else ""; `rank`: rank of [C_q; A]."""
     if rank == 0 or certainly_exceed(WEAK_RATIO, system.rows(t, q), rank):
         return ""
     ratio = singular_ratio(system, t, q, rank)

@@ -21,18 +21,18 @@ from twoloop.run.singular_positions import DISPLACEMENT, scaled_to_unit_masses
 
 Array = NDArray[np.float64]
 
-CHANGE_PER_SAMPLE = 3e-3  # relative change of C_q between two successive samples of a finite difference in time
+CHANGE_PER_SAMPLE = 3e-3  # finite differences in time use samples between which C_q changes by about this fraction
 # weights of five equidistant samples in finite differences; row 0: first derivative, row 1: second derivative
 WEIGHTS = np.array([[1.0, -8.0, 0.0, 8.0, -1.0], [-1.0, 16.0, -30.0, 16.0, -1.0]]) / 12.0
-# assumed relative error of finite differences: a derivative of C_q below this fraction of C_q is taken for zero
+# assumed relative error of finite differences: if a displacement of max|q| changes C_q less, dC_q/dt counts as zero
 MAX_DIFFERENCE_ERROR = 1e-8
 # the rank of C_q rises along the motion if (ds/dt) / |dC_q/dt| exceeds this; s: a singular value, zero at the start
 MIN_RANK_DERIVATIVE = 1e-6
-# the time derivative of a singular value that is zero at the start is certainly not zero if it exceeds this number
-# times an uncertainty: the norm of dC_q/dt for a velocity as large as the tolerances
+# let s be a singular value of C_q that is zero at the start: ds/dt is certainly not zero if it exceeds this multiple of
+# its uncertainty, which is the norm of dC_q/dt for a velocity as large as the tolerances
 MIN_CLARITY = 10.0
-# BESIDE_CHANGE: relative change of C_q from the singular start to the nearby state from which the run starts;
-# STEP_CHANGE: relative change of C_q in the first step
+# a run begins beside its singular start, at a state where C_q has changed by the fraction BESIDE_CHANGE or less. Its
+# first step changes C_q by about the fraction STEP_CHANGE
 BESIDE_CHANGE, STEP_CHANGE = 0.1, 0.6
 # up to N_BESIDE states near the singular start are tried, each half as far away as the last. A state is accepted if its
 # projection onto the constraints moves it by at most MAX_CORRECTION times the state's distance from the start
@@ -66,7 +66,7 @@ def branch_at(system: ConstrainedSystem, t: float, state: Array, rank: int, allo
         return None
     try:
         return _branch_at(system, t, state, rank, allowed)
-    except Exception:  # callbacks may fail beside the start
+    except Exception:  # callbacks may fail at states near the start: treat the start as not singular
         return None
 
 

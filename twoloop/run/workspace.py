@@ -42,8 +42,8 @@ Array = NDArray[np.float64]
 
 # to find out if forces depend on a coordinate or velocity x, x is displaced by this number times max(1, |x|)
 DISPLACEMENT = 1e-3
-# Newton's matrix in implicit steps is factorized as a sparse matrix if at most this fraction of its force derivatives
-# is nonzero, and if this takes at most this fraction of the operations of dense factorization
+# implicit steps use sparse factors of Newton's matrix if at most this fraction of the derivatives of forces is nonzero,
+# and if sparse factorization takes at most this fraction of the operations of dense factorization
 MAX_NEWTON_SHARE = 0.2
 
 
@@ -116,7 +116,7 @@ MASSLESS_RATIO = 1e-10  # eigenvectors of a body's block of M are massless if ei
 # along massless directions is longer than this fraction of |g|
 MIN_MASSLESS_FRACTION = 1e-3
 MIN_SIZE_NEWTON = 1.6  # Newton's matrix gets dense factors if n_q < this * LARGE (smallest n_q of a large system)
-MAX_SHARE = 0.05  # M and C_q are factorized as sparse matrices if this takes at most this fraction of dense operations
+MAX_SHARE = 0.05  # M and C_q get sparse factors if these take at most this fraction of the operations of dense ones
 
 
 class FixedOrderForm(NamedTuple):
@@ -150,7 +150,7 @@ class FixedOrderForm(NamedTuple):
 
 
 def fixed_order_form(system: ConstrainedSystem, t0: float, q0: Array, *plans: Plan) -> FixedOrderForm | None:
-    """Return the fixed-order form of a system for `plans`; None if a plan cannot use it, or if it would be slower."""
+    """Return the fixed-order form of a system for `plans`; None if a plan cannot use it, or dense algebra is faster."""
     if system.n_q < LARGE or system.n_c == 0 or system.n_a > 0 or system.bandwidth is not None:
         return None
     has_gamma = "gamma" in system.given or system.functions.gamma_program.size > 0
@@ -257,7 +257,7 @@ def _stiff_rows(
 
 
 def _massless_directions(block: Array) -> Array:
-    """Return the massless directions of a body, as rows, given its block of M; all directions if it is not finite."""
+    """Return the massless directions of a body, as rows, given its `block` of M; if this is not finite, return all."""
     if not np.isfinite(block).all():
         return np.eye(len(block))
     values, directions = np.linalg.eigh(block)
@@ -275,7 +275,7 @@ def _nonzero_entries(pattern: Array) -> Entries:
 
 
 def _mass_pattern(system: ConstrainedSystem, t0: float, q0: Array) -> Array:
-    """Return a matrix with 1 where M is nonzero at one of several positions near q0, else 0."""
+    """Return a matrix with 1 where M is nonzero at any of several positions near q0, else 0."""
     pattern = np.zeros((system.n_q, system.n_q))
     magnitudes = np.maximum(np.abs(q0), np.abs(q0).max())
     directions = np.random.default_rng(5).uniform(-1.0, 1.0, (len(NEARBY), system.n_q))
@@ -344,7 +344,7 @@ def _dense_flags(system: ConstrainedSystem, t0: float, q0: Array, definite: bool
 
 
 def sparse_factors_pay(system: ConstrainedSystem, flags: Array) -> bool:
-    """Return True if sparse factors of the augmented form would be faster than dense ones (by matrix sizes)."""
+    """Return True if sparse factors of the augmented form are faster than dense ones, judged by matrix sizes."""
     return sparse_pays(system.n_q, system.n_c + system.n_a, bool(flags[DIAGONAL_MASS]))
 
 
@@ -380,7 +380,7 @@ def kit_for_plan(system: ConstrainedSystem, flags: Array, plan: Plan | None) -> 
 
 
 def _steps_of_plan(plan: Plan) -> tuple[Any, Any, Any]:
-    """Return a plan's step, and both steps of its pair of methods (None: no pair; a placeholder: not loaded yet)."""
+    """Return a plan's Step and both Steps of its pair; None without a pair, PLACEHOLDER_STEP if not imported yet."""
     return load_step(plan.step), load_step(plan.first), step_if_loaded(plan.second)
 
 

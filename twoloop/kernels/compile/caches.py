@@ -97,7 +97,7 @@ def trusted_folder(folder: Path) -> Path:
 
 
 def reason_to_distrust(folder: Path) -> str:
-    """Return why another user may be able to write to a folder or a folder above it; "" if no other user is."""
+    """Return a reason if another user may be able to write to a folder or to a folder above it; otherwise return ""."""
     if os.name != "posix":  # on Windows, the mode does not contain the access rights
         return ""
     real_path = Path(os.path.realpath(folder))
@@ -108,7 +108,7 @@ def reason_to_distrust(folder: Path) -> str:
             continue
         except OSError as error:
             return f"{each} cannot be examined ({error.strerror})"
-        # all users may write to a sticky folder such as /tmp, but only its owner and a file's owner can replace a file
+        # anybody can create files in a sticky folder (/tmp), but only the folder's or file's owner can replace a file
         is_sticky = each != real_path and status.st_mode & stat.S_ISVTX
         reason = _reason_of_owner(status) if is_sticky else _reason_of_mode(status)
         if reason:
@@ -372,7 +372,7 @@ def sources_folder() -> Path:
 
 @cache
 def warn_once(text: str) -> None:
-    """Print a text on stderr, once in a process."""
+    """Print a text on stderr, unless this process has already printed it."""
     print(text, file=sys.stderr, flush=True)
 
 
@@ -383,7 +383,7 @@ def compiled_when_called(**options: Any) -> Callable[[Callable[..., Any]], Dispa
         digests = digests_of(function)
         dispatcher = njit(**options)(give_unique_name(function, digests))
         if digests is not None:
-            # for `_use_twoloop_cache`, which recompiles this function if a callback calls it and its digests changed
+            # `_use_twoloop_cache` recompiles this function if a callback calls it and its digests differ from these
             _COMPILED_DIGESTS[dispatcher] = digests
             with suppress(RuntimeError):  # if no folder can be written, do not store machine code
                 dispatcher._cache = _CodeCache(dispatcher.py_func, *digests, "")

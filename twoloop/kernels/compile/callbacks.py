@@ -34,12 +34,12 @@ from twoloop.kernels.compile.dependencies import (
 from twoloop.kernels.compile.linking import add_signature, options_of
 
 BOUNDS_CHECK = {"boundscheck": True}  # option of numba: machine code raises IndexError for an invalid index
-# built-in functions whose results need no check as indices if their arguments need none (constants, loop counters)
+# built-in functions: if their arguments are safe indices, such as constants or loop counters, their results are, too
 SAFE_CALLS = ("len", "min", "max", "abs", "range", "enumerate", "zip", "reversed")
 
 
 def add_bounds_checks(function: Callable[..., Any]) -> tuple[Callable[..., Any], dict[str, Any]]:
-    """Return the function to compile for a callback, and options of numba, so that its indices are checked.
+    """Return the function to compile for a callback, and the options of numba with which machine code checks indices.
 
     The options are empty if no index is computed. If a compiled function that the callback calls (a helper) computes
     indices, the returned function is a copy of the callback that calls copies of all helpers with checks.
@@ -51,7 +51,7 @@ def add_bounds_checks(function: Callable[..., Any]) -> tuple[Callable[..., Any],
 
 
 def _compile_with_bounds_checks(copy: Any, original: Any) -> Any:
-    """Return a copied function; if the `original` is compiled, compile the copy with checks of its indices."""
+    """Return the `copy` of a function; if the `original` is compiled, compile the copy with checks of its indices."""
     helper = python_function(original)
     if helper is None:
         return copy
@@ -65,7 +65,7 @@ def has_computed_indices(function: Callable[..., Any]) -> bool:
         return False
     try:
         tree = ast.parse(textwrap.dedent(inspect.getsource(function)))
-    except (OSError, TypeError, SyntaxError):  # typed at a prompt, or the source is only part of a statement (lambda)
+    except (OSError, TypeError, SyntaxError):  # the function was typed at a prompt, or is part of a statement (lambda)
         return True
     computed = _computed_names(tree)
     return any(not _is_safe_index(node.slice, computed) for node in ast.walk(tree) if isinstance(node, ast.Subscript))
@@ -114,10 +114,10 @@ def _is_safe_index(node: ast.AST | None, computed: set[str]) -> bool:
 
 f8 = numba.types.float64
 VECTOR = numba.types.float64[::1]
-READ_ONLY_VECTOR = numba.types.Array(f8, 1, "C", readonly=True)  # machine code for it accepts any VECTOR
+READ_ONLY_VECTOR = numba.types.Array(f8, 1, "C", readonly=True)  # machine code for it also accepts writable vectors
 MATRIX = numba.types.float64[:, ::1]
 
-# keys: names of vectors that callbacks receive (lam: multipliers of C = 0); values: attributes of a system: their sizes
+# attributes of a system with the sizes of the vectors that callbacks receive; lam: multipliers of C = 0
 STATE_SIZES = {"q": "n_q", "v": "n_q", "lam": "n_c"}
 
 
@@ -405,7 +405,7 @@ def _compile_with_writable_inputs(
 ) -> Dispatcher:
     """Compile a callback for writable input arrays, because its compilation for read-only ones raised `error`.
 
-    Raise TypeError if this fails, too, or if `error` does not show that only a helper rejects read-only arrays.
+    Raise TypeError if this fails, or if `error` has another cause than a called function that rejects read-only arrays.
     """
     try:
         dispatcher = compile_cached(function, KINDS[kind].signature, digests, **options)

@@ -35,7 +35,7 @@ DIGEST_VERSION = 2  # part of all digests: increase it to make all machine code 
 
 
 def digest_of(text: str, *sources: str | types.ModuleType) -> str:
-    """Return one hash of a text and of source files (paths or modules); if it changes, cached files are outdated."""
+    """Return one hash of a text and source files (paths or modules); if the hash changes, cached files are outdated."""
     digest = hashlib.sha256(text.encode())
     for source in sources:
         digest.update(Path(source if isinstance(source, str) else str(source.__file__)).read_bytes())
@@ -65,7 +65,7 @@ class Digest:
     def __init__(self) -> None:
         self.hash = hashlib.sha256(f"{DIGEST_VERSION} {np.__version__}".encode())
         self.names: set[str] = set()  # if a value is a module, only its attributes with these names are hashed
-        # serial numbers of values hashed already, by id of a module and attribute name, or by id of a helper and ""
+        # serial numbers of hashed values; key: (id of a module, name of an attribute), or (id of a helper, "")
         self.positions: dict[tuple[int, str], int] = {}
         self.helpers: list[Any] = []  # compiled helpers hashed so far; a helper comes after the helpers that it calls
 
@@ -97,7 +97,7 @@ class Digest:
             self._add_name(value)
 
     def add_function(self, function: Any, enclosed: bool = True) -> None:
-        """Add the code, the defaults and the globals of a function; if `enclosed`, also its closure variables."""
+        """Hash the code, the defaults and the globals of a function; if `enclosed`, also its closure variables."""
         outer, self.names = self.names, reachable_names(function)
         self.add([function.__code__, function.__defaults__, function.__kwdefaults__])
         if enclosed:
@@ -300,7 +300,7 @@ def _direct_locations(function: FunctionType) -> Iterator[FrozenValue]:
 
 
 def _locations_in_module(location: FrozenValue, attributes: tuple[str, ...], names: set[str]) -> Iterator[FrozenValue]:
-    """Yield the attributes of a user's module (`location`), and of modules within this module, that a function uses.
+    """Yield the attributes that a function uses of a user's module (`location`) and of modules within this module.
 
     `attributes`: names loaded one after another, such as ("inner", "K") for `module.inner.K`. If it is empty, the
     function assigns the module to a variable or passes it on: then yield all attributes whose names are in `names`.
@@ -345,7 +345,7 @@ class FunctionCopier:
         self.copies: dict[Any, Any] = {}  # replacements, by id of the original
 
     def replacement_of(self, value: Any, names: frozenset[str] = frozenset()) -> Any:
-        """Return a helper's replacement, a tuple or module (its `names`) with such replacements, or `value` itself."""
+        """Return `value` after replacing helpers: itself, items of a tuple, or the attributes `names` of a module."""
         if self.is_copied(value):
             if id(value) not in self.copies:
                 self._add_copy(value)
@@ -357,7 +357,7 @@ class FunctionCopier:
         return value
 
     def is_copied(self, value: Any) -> bool:
-        """Return True if a value is a compiled helper, which is replaced; a derived class may replace other values."""
+        """Return True for compiled helpers, which `replacement_of` then copies; derived classes may add values."""
         return isinstance(value, Dispatcher) or bool(jitable_templates(value))
 
     def _copy_module(self, module: types.ModuleType, names: frozenset[str]) -> types.ModuleType:
@@ -382,7 +382,7 @@ class FunctionCopier:
         own_globals = dict(function.__globals__)
         copy = types.FunctionType(function.__code__, own_globals, function.__name__, function.__defaults__, cells)
         copy.__kwdefaults__, copy.__qualname__ = function.__kwdefaults__, function.__qualname__
-        self.copies[id(helper)] = self.wrap(copy, helper)  # before the next lines: the helper may call itself
+        self.copies[id(helper)] = self.wrap(copy, helper)  # stored first, as a helper that calls itself needs it
         for name in used_names & set(own_globals):
             own_globals[name] = self.replacement_of(own_globals[name], names)
         if function.__defaults__ is not None:

@@ -70,7 +70,7 @@ def generated_functions(
     files, disk_key = _code_files(kind, stamp), _disk_key(key)
     try:
         names_and_content = files.load(disk_key)
-    except Exception:  # the file is incompatible, from another installation: compile, and overwrite it below
+    except Exception:  # another installation wrote an incompatible file: compile, and replace the file below
         names_and_content = None
     if names_and_content is None:
         names, text = write()
@@ -144,7 +144,7 @@ def _target_triple() -> str:
 
 
 def _new_target_machine() -> Any:
-    """Return a new LLVM target machine for the processor for which numba compiles; each engine needs its own."""
+    """Return a new LLVM target machine for the processor for which numba compiles; each execution engine needs one."""
     options: dict[str, Any] = {"opt": 1}  # level 2 would compile a quarter longer, and not make generated code faster
     cpu_target.target_context.codegen()._customize_tm_options(options)
     return binding.Target.from_triple(_target_triple()).create_target_machine(**options)

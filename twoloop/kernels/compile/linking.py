@@ -55,19 +55,19 @@ def jitable_templates(function: Any) -> list[Any]:
         return []
     closures = [getattr(getattr(each, "_overload_func", None), "__closure__", None) for each in templates]
     is_own = [any(cell.cell_contents is function for cell in source or ()) for source in closures]
-    return templates if all(is_own) else []  # not all: calls of this function are compiled from another one (overload)
+    return templates if all(is_own) else []  # []: numba compiles calls of this function from an overload
 
 
 def add_signature(function: Dispatcher, signature: Any) -> None:
     """Let numba call a compiled function also with the argument types of `signature`, without compiling it again.
 
-    The types must have the same layout in memory, such as writable arrays in place of read-only ones in a callback.
+    In memory, the types must be like the compiled ones: for example, writable arrays are like read-only arrays.
     """
     dispatcher: Any = function
     (compiled,) = dispatcher.overloads.values()
     dispatcher._insert([each._code for each in signature.args], compiled.entry_point, False)
     dispatcher.overloads[signature.args] = compiled._replace(signature=signature)
-    description = copy(compiled.fndesc)  # numba reads the argument types from it to compile calls of the function
+    description = copy(compiled.fndesc)  # from this, numba reads the argument types to compile calls of the function
     description.argtypes = signature.args
     dispatcher.targetctx.insert_user_function(compiled.entry_point, description, [compiled.library])
 
@@ -99,7 +99,7 @@ _numba_basic_indexing: Any = arrayobj.basic_indexing
 def _emit_element_address(
     context: Any, builder: Any, kind: Any, array: Any, index_types: Any, indices: Any, **options: Any
 ) -> Any:
-    """Emit code for the address of an element of a contiguous array; in other cases, call numba's own function."""
+    """Emit code for the address of an element of a contiguous array; for slices or other arrays, use numba's code."""
     is_element = len(indices) == kind.ndim and all(isinstance(each, types.Integer) for each in index_types)
     if kind.layout != "C" or not is_element or options.get("boundscheck"):
         return _numba_basic_indexing(context, builder, kind, array, index_types, indices, **options)
@@ -154,7 +154,7 @@ def _cached_inlined_code(self: Any, function: Any, enable_ssa: bool = False) -> 
         _inlined_code[function, enable_ssa] = _numba_inlined_passes(self, function, enable_ssa)
     self.flags.enable_ssa = enable_ssa
     code = copy(_inlined_code[function, enable_ssa])
-    code.func_id = FunctionIdentity.from_function(function)  # makes names of variables unique in each copy
+    code.func_id = FunctionIdentity.from_function(function)  # so that variables of each copy have their own names
     return code
 
 
@@ -209,8 +209,8 @@ _RULES: list[tuple[Any, str, Callable[..., Any]]] = [
     (event, "start_event", _skip_lock_events(event.start_event)),
     (event, "end_event", _skip_lock_events(event.end_event)),
 ]
-_MISSING_ATTRIBUTE = object()  # stands for the original of an inherited attribute, which is restored by deletion
-_depth = [0]  # number of active contexts `kernel_rules`, which may be nested: the outermost one replaces and restores
+_MISSING_ATTRIBUTE = object()  # stands for the original of an inherited attribute: its replacement will be deleted
+_depth = [0]  # number of active contexts `kernel_rules`; only the outermost one replaces and restores functions
 
 
 @contextmanager

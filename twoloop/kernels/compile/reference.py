@@ -53,7 +53,7 @@ class Reference(types.Type):
         self.elements = {element: (array, i) for array, named in elements.items() for element, i in named.items()}
         self.functions: dict[str, Signature] = {}
         self.llvm_functions: set[str] = set()  # fields in `functions` whose functions are generated as LLVM code
-        self.offsets: dict[str, int] = {}  # index of a field's address in the table; sizes of an array follow
+        self.offsets: dict[str, int] = {}  # index of each field's address in the table; sizes of an array follow it
         self.n_words = 0  # length of the table so far
         self._addresses: Any = BoundedCache()  # addresses of machine code, by the tuple of all functions of a structure
         for field, kind in self.arrays.items():
@@ -212,7 +212,7 @@ def _load_array(context: Any, builder: Any, typ: Any, pointer: Any, field: str) 
     }
     model = context.data_model_manager[kind]
     array = ir.Constant(context.get_value_type(kind), ir.Undefined)
-    for name, value in fields.items():  # so LLVM keeps the array in registers; numba's own function uses memory
+    for name, value in fields.items():  # LLVM keeps an array built like this in registers, not in memory
         index = model.get_field_position(name)
         element = ir.Constant(array.type.elements[index], None) if value is None else value
         array = builder.insert_value(array, element, index)

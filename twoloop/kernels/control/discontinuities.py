@@ -38,7 +38,7 @@ RATE_ROUNDING = 1e-11  # error of the twelfth difference due to rounding of samp
 TIME_ROUNDING = 5e3  # error of the twelfth difference due to rounding of t, relative to np.spacing(t) * (mean slope)
 STEEPNESS = 4.0  # a part of a step is a ramp if C_t or b is this many times steeper in the part than in the whole step
 MAX_RAMP_SHARE = 0.125  # only a ramp of C_t or b that takes at most this fraction of a step is located within the step
-MIN_SPACINGS = 8.0  # bisection for a jump ends at a time span of this number of spacings of floating-point numbers
+MIN_SPACINGS = 8.0  # bisection for a jump ends if the time span is at most this many spacings of floating-point times
 SMOOTH, RAMP, JUMP = range(3)  # C_t and b in a time span are SMOOTH, or have a steep RAMP or a kink, or have a JUMP
 
 
@@ -65,7 +65,7 @@ def _twelfth_difference(w, row):
 
 @compiled
 def _slope_and_size(w, row, length):
-    """Return the mean |slope| (per s) and the largest |value| of the samples w.rates[:, row], which span `length` s."""
+    """Return the mean |slope| (per s) and the largest |value| of samples w.rates[:, row] over a time `length` (s)."""
     change = 0.0
     largest = abs(w.rates[0, row])
     for k in range(N_PARTS):
@@ -104,11 +104,11 @@ def unexplained_velocity_change(tolerances, h, state, new_state, n):
 
 @compiled
 def locate_discontinuity(f, w, t, end, q, v, velocity, tolerances):
-    """Search the least smooth component of (C_t, b) from t to `end`; return SMOOTH, RAMP or JUMP, and two times (s).
+    """Find where C_t or b has a jump or a ramp between t and `end`; return SMOOTH, RAMP or JUMP, and two times (s).
 
-    The times are the ends of the jump or ramp; t and `end` if all is smooth. If a ramp fills the time span, return the
-    ends of its first half: a method that evaluates accelerations only at the ends of a ramp, where they may be
-    zero, would miss the ramp. (q, v): state at t. C_t and b are sampled at positions q + velocity * (time - t).
+    The times are the ends of the jump or ramp of the least smooth component, or t and `end` if all are smooth. If a
+    ramp fills the time span, return the ends of its first half: a method that evaluates accelerations only at the ends
+    of a ramp, where they may be zero, would miss it. (q, v): state at t. Samples are at q + velocity * (time - t).
     """
     begin = t
     h = end - t
@@ -151,7 +151,7 @@ def locate_discontinuity(f, w, t, end, q, v, velocity, tolerances):
             return JUMP, begin, end
     if steepest > STEEPNESS * mean:
         return RAMP, low, high
-    if end - begin < h:  # also half of the step is not smooth: a ramp fills the step, or C_t or b has a kink
+    if end - begin < h:  # one half of the step is not smooth, either: a ramp fills the step, or C_t or b has a kink
         return RAMP, t, t + 0.5 * h
     return SMOOTH, t, t + h
 
@@ -162,7 +162,7 @@ SUDDEN_RATIO = 0.1  # a change is sudden if the second difference exceeds this f
 # a force, C_t or b counts as constant if its samples differ by at most LEAST_RANGE * rtol times the largest value so
 # far, or by at most LEAST_VALUE, as squares of smaller numbers underflow
 LEAST_RANGE, LEAST_VALUE = 0.1, 1e-150
-MIN_SAMPLES_IN_STEP = 8.0  # least number of samples in a step: stages may miss a force that lasts a quarter of a step
+MIN_SAMPLES_IN_STEP = 8.0  # least number of samples in a step; stages may miss a force that lasts a quarter of a step
 RESAMPLE_BELOW = 0.25  # sample again if the time between samples must be below this fraction of the last such time
 MIN_SPACING = 16.0  # shortest time between samples, in spacings of floating-point numbers at t
 N_BISECTIONS = 20  # number of bisections that locate the time of a change between two samples
@@ -173,14 +173,14 @@ MIN_RECORDED_TIME = 5e-5
 MIN_STEEPNESS_RATIO = 2.0  # a change between two samples is sudden if it exceeds this times the changes next to it
 SHORT_STEP = 0.5  # steps below this fraction of the longest recent step are searched for pulses of forces, C_t and b
 N_SAMPLES_IN_SHORT_STEP = 4  # number of samples within a short step, in search of pulses
-# accelerations do not last if one of them changes by more than this fraction of the largest, when velocities change by
-# their tolerances at most, see `_acceleration_lasts`
+# if a change of velocities by at most their tolerances changes an acceleration by more than this fraction of the
+# largest one, motion is not extrapolated with the present accelerations, see `_acceleration_lasts`
 MAX_LASTING_CHANGE = 0.5
 # a step need not end at a change if the step begins before it by at most this fraction of the time between samples
 CHANGE_MARGIN = 0.01
-# w.changes has a column for each force, C_t and b; its rows 0 to N_SAMPLES contain the samples of one set
+# w.changes has a column for each force, C_t and b; rows 0 to N_SAMPLES contain samples at successive times
 LARGEST_ROW = N_SAMPLES + 1  # row of w.changes: largest |value| of each force, C_t and b so far
-MIDDLE_ROW = N_SAMPLES + 2  # row of w.changes: one more sample, at a time between or before the samples of the set
+MIDDLE_ROW = N_SAMPLES + 2  # row of w.changes: one more sample, at a time between or before the other samples
 N_CHANGES = N_SAMPLES + 3  # number of rows of w.changes
 
 
@@ -235,13 +235,13 @@ def _find_sudden_bend(values, n, slope, min_range, strict):
 
 @compiled
 def _first_sudden_bend(values, n, detrends, min_range):
-    """Search n + 1 samples by `_find_sudden_bend`; return the index of the first sudden bend (0: none), and the limit.
+    """Find the first sudden bend of n + 1 samples; return its index (0: none), and the limit that its size exceeds.
 
-    After a bend is found, search the samples before it, until there is no earlier bend. If `detrends` is 1, subtract
-    the straight line from the first to the last sample searched; if it is 0, subtract nothing.
+    `_find_sudden_bend` searches all samples, then those before the bend found, until it finds no earlier bend. It
+    subtracts the straight line from the first to the last searched sample if `detrends` is 1, nothing if it is 0.
     """
     index, limit = _find_sudden_bend(values, n, detrends * (values[n] - values[0]) / max(n, 1), min_range, False)
-    while index > 1:  # strict = True below, because a few samples of a smooth curve may bend as much as a jump
+    while index > 1:  # skip smooth bends here (True), because a few samples of a smooth curve may bend like a jump
         slope = detrends * (values[index] - values[0]) / index
         earlier, bound = _find_sudden_bend(values, index, slope, min_range, True)
         if earlier == 0:
@@ -254,7 +254,7 @@ def _first_sudden_bend(values, n, detrends, min_range):
 def _is_sudden_change(previous, first_value, second_value, following, limit):
     """Return True if `second_value` differs from `first_value` by more than `limit`, and much more than nearby samples.
 
-    The change must exceed MIN_STEEPNESS_RATIO times the changes in its direction, from `previous` and to `following`.
+    The changes from `previous` and to `following`, unless of opposite sign, must be MIN_STEEPNESS_RATIO times smaller.
     """
     change = second_value - first_value
     sign = 1.0 if change > 0.0 else -1.0
@@ -264,7 +264,7 @@ def _is_sudden_change(previous, first_value, second_value, following, limit):
 
 @compiled
 def _locate_change(f, w, low, high, k, j, q, v, a):
-    """Return the time just after a force, C_t or b (column j) jumps between samples k (time low) and k + 1 (high)."""
+    """Return the time just after column j of w.changes jumps between row k (time `low`) and row k + 1 (time `high`)."""
     changes = w.changes
     before, after = changes[k, j], changes[k + 1, j]
     for _ in range(N_BISECTIONS):
@@ -390,9 +390,9 @@ def _acceleration_lasts(f, w, tolerances, t, duration, q, v, a, Q, V, A):
 
 @compiled
 def _sample_motion(f, w, tolerances, control, clock, spacing, t, size, last, q, v, a, Q, V, A):
-    """If earlier samples along the motion end within the step, take new ones; store the next sudden change in `clock`.
+    """Sample forces, C_t and b along the motion if earlier samples end within the step; find the next sudden change.
 
-    New samples extend from t over the step size or, if longer, MIN_TIME_AHEAD times `spacing`, but not beyond `last`.
+    Store this change in `clock`. Samples extend over max(`size`, MIN_TIME_AHEAD * `spacing`), but not beyond `last`.
     """
     if clock[at.MOTION_SAMPLED_TO] >= t + (1.0 - CHANGE_MARGIN) * size:
         return
@@ -407,7 +407,7 @@ def _sample_motion(f, w, tolerances, control, clock, spacing, t, size, last, q, 
             f, w, tolerances, clock, t, t, duration / N_SAMPLES, last, 1.0, q, v, A
         )
     clock[at.SAMPLES_MOTION] = 0.0
-    # samples along the motion, if close enough, replace samples at a fixed state, unless the latter end at a change
+    # if no change was found at a fixed state, samples along the motion, unless farther apart, replace the samples there
     change_found = clock[at.SAMPLED_TO] == clock[at.DISCONTINUITY] > t
     if not change_found and duration <= N_SAMPLES * min(control[at.TIME_SPACING], size / MIN_SAMPLES_IN_STEP):
         clock[at.WIDEST_SAMPLING] = max(clock[at.WIDEST_SAMPLING], duration / N_SAMPLES)
@@ -420,18 +420,18 @@ def _sample_motion(f, w, tolerances, control, clock, spacing, t, size, last, q, 
 
 @compiled
 def _sample_ahead(f, w, tolerances, control, clock, next_change, t, size, last, q, v, a):
-    """Sample forces, C_t and b in a step from t, but not after `last`, with q and v fixed.
+    """Sample forces, C_t and b ahead of t, with q and v fixed; return the time of the next sudden change.
 
-    Return the time of the next sudden change: `next_change`, known before (infinite: none), or an earlier change.
+    This is `next_change`, which was known before (infinite: none), or an earlier change. No sample is after `last`.
     """
     max_spacing = max(min(control[at.TIME_SPACING], size / MIN_SAMPLES_IN_STEP), MIN_SPACING * np.spacing(abs(t)))
-    # times that have been sampled before are sampled again if samples must be much closer now. Not so for multistep
-    # methods (JUMP_RATIO = 1), whose error estimates show a jump, nor if each step is checked for jumps (MAY_JUMP = 1)
+    # if samples must be much closer now, times are sampled again. Multistep methods (JUMP_RATIO = 1) do not need this,
+    # because their error estimates show a jump, nor do runs in which each step is checked for jumps (MAY_JUMP = 1)
     may_resample = control[at.JUMP_RATIO] > 1.0 and control[at.MAY_JUMP] == 0.0
     if may_resample and max_spacing < RESAMPLE_BELOW * clock[at.SAMPLED_EVERY]:
         clock[at.SAMPLED_TO] = t
     begin = max(t, clock[at.SAMPLED_TO])
-    is_at_change = clock[at.DISCONTINUITY] == clock[at.SAMPLED_TO]  # then sample as closely as last time
+    is_at_change = clock[at.DISCONTINUITY] == clock[at.SAMPLED_TO]  # if True, sample at least as closely as last time
     while begin < min(t + size, last, next_change):
         spacing, is_at_change = min(max_spacing, clock[at.SAMPLED_EVERY]) if is_at_change else max_spacing, False
         clock[at.WIDEST_SAMPLING] = max(clock[at.WIDEST_SAMPLING], spacing)

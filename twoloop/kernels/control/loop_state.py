@@ -45,12 +45,12 @@ H_BEFORE, ERROR_BEFORE, N_PAST = range(3)
     SYMMETRIC,  # 1: each step chooses the partition at its midpoint; 0: a partition is kept as long as it is good
     MAX_ATTEMPTS,  # number of attempted steps after which `advance` returns; its caller then checks progress and time
     # 1: near a singular position, `advance` returns NEAR_SINGULAR, and the caller crosses the position. 0: `advance`
-    # never returns this code. SUSPENDED: not returned near the present singular position; far from there, 1 is stored
+    # never returns this code. SUSPENDED: like 0 near the present singular position; far away from it, 1 is stored here
     MAY_CROSS,
     SHORTEST,  # steps must be longer than this (s), and longer than EQUAL_SPACINGS spacings of floating-point times
     MAY_SWITCH,  # 1: `advance` returns SWITCH_METHOD if a value is not finite, or a step returns UNSUITED; 0: never
-    # a method on trial is given up in one of its first TRIAL_STEPS steps (`advance` returns SWITCH_METHOD) if the next
-    # step size is at most tolerances[GAP], the longest allowed time between evaluations; -1: no method is on trial
+    # number of steps for which a method is on trial; -1: no trial. If a step size proposed in these steps is at most
+    # tolerances[GAP], the longest allowed time between evaluations, the trial fails: `advance` returns SWITCH_METHOD
     TRIAL_STEPS,
     MAY_JUMP,  # 1: a constraint rate, C_t or b (in A v + b = 0), may jump; 0: constraint rates are continuous
     JUMP_RATIO,  # largest ratio of a step's true error to its error estimate if a force jumps within the step
@@ -61,14 +61,14 @@ H_BEFORE, ERROR_BEFORE, N_PAST = range(3)
     BY_STATE,  # 1: a force may change suddenly with q or v: steps longer than SPACING sample the motion; 0: none does
     FIRST_GIVEN,  # 1: the user has chosen the first step size; 0: it is a guess, and may grow before a step is accepted
     MAX_EVALUATION_GAP,  # longest time in a step between two evaluations of the equations, relative to the step size
-    TAKES_MANY,  # 1: the method has a function `attempt_many`, which takes steps without checks between them; 0: none
+    TAKES_MANY,  # 1: the method has `attempt_many`, which takes steps without checks between them; 0: it does not
     CHECKS_WITHIN,  # 1: once a run has come near a singular position, check pivots of C_q within each step; 0: never
     N_CONTROL,
 ) = range(N_RULE, N_RULE + 25)
 
-# columns of `out_steps`, which has one row for each accepted step: the step size H (s), and counts since the start of
-# the run, of steps rejected for their errors, of steps that failed, of chosen partitions, and of Jacobians evaluated by
-# an implicit method (0 in the row of an explicit step)
+# columns of `out_steps`, which has one row for each accepted step. H: step size (s). The other columns count since the
+# start of the run: steps rejected for their ERRORS; FAILURES of steps; chosen PARTITIONS; JACOBIANS evaluated by an
+# implicit method (0 in the row of an explicit step)
 H, ERRORS, FAILURES, PARTITIONS, JACOBIANS, N_STEP_COLUMNS = range(6)
 
 # indices in `clock`, after the history of step-size control
@@ -88,20 +88,20 @@ H, ERRORS, FAILURES, PARTITIONS, JACOBIANS, N_STEP_COLUMNS = range(6)
     JUMP_TO,  # end (s) of the short time span with the next known jump of a constraint rate (C_t, b)
     APPLIES_JUMP,  # 1: the next step ends at JUMP_TO, in the state that `new_state` already contains; 0: ordinary step
     JUMP_END,  # end (s) of the last step rejected with a very large error: a force may jump before this time
-    # fixed-order form: smallest pivot at the end of the last accepted step, or of a later step near a singular position
+    # fixed-order form: smallest pivot after the last accepted step, or after a later step that `ends_near_singular`
     PIVOT_HERE,
-    # samples of forces, C_t and b ahead of a step: at a fixed state, where the step begins, or along predicted motion
+    # forces, C_t and b are sampled ahead of a step, at a fixed state (where the step starts) or along predicted motion
     SAMPLED_TO,  # time (s) of the last sample at a fixed state
     SAMPLED_EVERY,  # time (s) from one sample at a fixed state to the next, in the last set of samples
     WIDEST_SAMPLING,  # longest time (s) so far from one sample of the forces to the next
-    DISCONTINUITY,  # time (s) of the next sudden change in samples at a fixed state; infinite: none is known
-    DISCONTINUITY_OF_MOTION,  # time (s) of the next sudden change in samples along the motion; infinite: none is known
-    COMPARED,  # time (s) at which the last short step began that was searched for pulses of a force
+    DISCONTINUITY,  # time (s) of the next sudden change that samples at a fixed state show; infinite: none is known
+    DISCONTINUITY_OF_MOTION,  # time (s) of the next sudden change that samples along the motion show; infinite: unknown
+    COMPARED,  # start time (s) of the last short step that was searched for pulses of a force
     LAST_CHANGE,  # time (s) of the last sudden change of a force, C_t or b; -infinite: none
-    SHORTEST_CHANGE,  # shortest duration (s) of a pulse, or time between sudden changes, of a force; infinite: unknown
+    SHORTEST_CHANGE,  # shortest time (s) from one sudden change of a force, C_t or b to the next; infinite: unknown
     MOTION_SAMPLED_TO,  # time (s) of the last sample along the motion
-    SAMPLES_MOTION,  # 1 while callbacks are called at predicted states: exceptions there do not end the run; 0: else
-    # smallest ratio so far of the smallest to the largest pivot of [C_q; A], at output times and ends of fixed steps
+    SAMPLES_MOTION,  # 1 while callbacks are called at predicted states, where exceptions do not end a run; otherwise 0
+    # minimum of (smallest / largest pivot of [C_q; A]) over the output times and the ends of steps of fixed size so far
     PIVOT_AT_OUTPUT,
     # smallest pivot of C_q within steps taken while MAY_CROSS was SUSPENDED, divided by LARGEST_PIVOT; 0: no such step
     PIVOT_PASSED,

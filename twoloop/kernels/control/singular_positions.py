@@ -16,7 +16,7 @@ FIXED_ORDER_SINGULAR = 0.01
 # fixed-order form: if the smallest pivot is below this fraction of its maximum in the run, a rejected or failed step is
 # repeated with its stages projected onto the constraints
 REPEAT_PIVOT = 0.05
-SHRINKAGE = 0.8  # size of a step that is repeated again with projected stages, relative to the size rejected last
+SHRINKAGE = 0.8  # if a step with projected stages is rejected or fails, it is repeated with this fraction of its size
 MIN_STEP_NEAR_SINGULAR = 0.001  # shortest useful step near a singular position, relative to the longest recent step
 # if no crossing can be attempted, the run ends when the smallest pivot is below this fraction of its maximum in the run
 UNDETERMINED_PIVOT = 1e-6
@@ -40,8 +40,8 @@ MIN_END_RATIO = 0.25  # `ends_near_singular` is True only if the smallest pivot 
 def is_near_singular(f, w, control, clock, t, q):
     """Return True if a singular position is near the accepted position q at time t, and control[MAY_CROSS] is 1.
 
-    A position is near if the smallest pivot of C_q is small, or if no partition can be chosen. If the pivot of the last
-    partition, w.pivot, is small or may be old (generated code needs no partition), choose a new partition first.
+    A position is near if the smallest pivot of C_q is small, or if no partition can be chosen. Compute this pivot for a
+    new partition if its last value, w.pivot, is small, or may be old because generated code took the last steps.
     """
     if control[at.MAY_CROSS] != 1.0:
         return False
@@ -55,8 +55,8 @@ def is_near_singular(f, w, control, clock, t, q):
 def ends_near_singular(f, w, control, clock):
     """Return True if a step of the fixed-order form ends so near a singular position that no step should begin there.
 
-    The caller then repeats the step with another size: a singular position within it does no harm. Return False if the
-    smallest pivot is not much smaller than where the step begins, or for steps of fixed size.
+    The caller then repeats the step with another size, because a singular position within a step does no harm. Return
+    False for steps of fixed size, or if the smallest pivot has not become much smaller within the step.
     """
     if f.form != FIXED_ORDER or control[at.FIXED_STEP] > 0.0:
         return False
@@ -72,11 +72,11 @@ def is_too_short_near_singular(f, clock, size):
 
 @merged
 def prepare_projected_repetition(f, w, control, clock, size):
-    """Return True if a rejected or failed step of the fixed-order form is repeated near a singular position.
+    """Return True and prepare a repetition if a step of the fixed-order form did not succeed near a singular position.
 
-    Stages that violate the constraints have inaccurate accelerations there: set w.nearly_singular so that stages are
-    projected. Store the step size in clock[H_NEXT]. The first repetition is at least as long as clock[H_LONG], a recent
-    long step, because it may succeed if it ends well beyond the position; each further repetition is shorter.
+    Near this position, stages that violate the constraints have inaccurate accelerations: set w.nearly_singular so that
+    stages are projected. Store the step size in clock[H_NEXT]. The first repetition is at least as long as the longest
+    recent step, clock[H_LONG], because it may succeed if it ends well beyond the position; each further one is shorter.
     """
     is_near = clock[at.PIVOT_HERE] < REPEAT_PIVOT * clock[at.LARGEST_PIVOT]
     if f.form != FIXED_ORDER or control[at.FIXED_STEP] > 0.0 or w.nearly_singular == 1.0 or not is_near:
@@ -148,11 +148,11 @@ def comes_near_singular(f, w, control, clock, tolerances, t, size, state, new_st
 
 @merged
 def record_pivot_at_output(f, w, clock, state):
-    """Reduce clock[PIVOT_AT_OUTPUT] to the ratio of the smallest to the largest pivot at `state` if this is smaller."""
+    """Set clock[PIVOT_AT_OUTPUT] to the smaller of its value and the pivot ratio at `state`, see `min_pivot_ratio`."""
     pivot = min_pivot_ratio(f, w, clock[at.T], state[: w.Q.size])
     if f.form == FIXED_ORDER and pivot > 0.0:
-        # pivots of the fixed-order form are sines of angles between rows, and all small in large mechanisms: only the
-        # ratio of the smallest pivot to the largest value that it has had so far shows a singular position
+        # pivots of the fixed-order form are sines of angles between rows. In large mechanisms, all of them are small:
+        # only a smallest pivot far below its largest value so far, clock[LARGEST_PIVOT], shows a singular position
         pivot /= max(pivot, clock[at.LARGEST_PIVOT])
     clock[at.PIVOT_AT_OUTPUT] = min(clock[at.PIVOT_AT_OUTPUT], pivot)
 
@@ -194,11 +194,11 @@ def check_partition(f, w, control, clock, size, at_output, state):
         # w.pivot was computed when the partition was chosen: an old value may hide that a singular position is near
         if renew_partition(f, w, clock[at.T], state[:n]) != DONE:
             return at.RANK_LOST
-        w.sensitivity = 1.0  # value far from singular positions, so that `partition_is_poor` soon is True again
+        w.sensitivity = 1.0  # the least possible value, with which `partition_is_poor` returns True soonest
         if w.pivot < SINGULAR_PIVOT * clock[at.LARGEST_PIVOT]:
             w.nearly_singular = w.near_now = 1.0
     if short and size < MIN_STEP_NEAR_SINGULAR * clock[at.H_LONG] and w.nearly_singular == 1.0:
-        # if the old partition was chosen at a distant state, an implicit method may continue with a new partition
+        # steps of an implicit method may be this short because its partition was chosen at a distant state: renew it
         if renew_partition(f, w, clock[at.T], state[:n]) != DONE:
             return at.RANK_LOST
         if control[at.MAY_CROSS] != 1.0 and w.pivot < UNDETERMINED_PIVOT * clock[at.LARGEST_PIVOT]:

@@ -66,7 +66,7 @@ def record_accepted_step(rule, past, h, error):
 @compiled
 def project_and_evaluate(f, w, t, Q, V, A):
     """Project the state (Q, V) onto the constraints; store its accelerations in A; return DONE or a failure code."""
-    # PROJECT is the cheapest task in generated code; in the fixed-order form, EVALUATE would not project the state
+    # in generated code, the task PROJECT costs less than EVALUATE; in the fixed-order form, EVALUATE does not project
     if (f.is_generated == 1 and w.Rate.size == w.C.size) or f.form == FIXED_ORDER:
         return f.inner(f, w, PROJECT, t, Q, V, INNER_TOL, A, w.lam)
     return evaluate(f, w, t, Q, V, INNER_TOL, A)
@@ -104,12 +104,12 @@ def size_on_grid(clock, t, h, target, goal):
 
 
 @merged
-def size_off_grid(control, t, h, left, crosses_jump):
-    """Return a step size (s) up to about h, and True if the step ends at t + left instead: always if `crosses_jump`."""
-    reaches_goal = crosses_jump or h >= left * (1.0 - 1e-10)
+def size_off_grid(control, t, h, time_to_goal, crosses_jump):
+    """Return a step size (s) of at most about h, and whether the step must take `time_to_goal` (s) instead."""
+    reaches_goal = crosses_jump or h >= time_to_goal * (1.0 - 1e-10)
     size = h
-    if h > 0.5 * left and not reaches_goal:
-        size = 0.5 * left  # take two equal steps instead of a long step and a tiny one
+    if h > 0.5 * time_to_goal and not reaches_goal:
+        size = 0.5 * time_to_goal  # take two equal steps instead of a long step and a tiny one
     size = representable_step(t, size)
     if size > control[at.MAX_STEP]:
         size = representable_step(t, size - np.spacing(abs(t + size)))
@@ -121,7 +121,7 @@ H_LONG_DECAY = 0.98  # factor by which each accepted step reduces clock[H_LONG],
 
 @merged
 def count_step(w, tolerances, control, clock, size, out_step):
-    """Count an accepted step of size `size` (s): update clock[H_LONG] and statistics in w; fill `out_step`."""
+    """Record an accepted step of `size` (s) in `out_step`, statistics in `w`, and the longest recent size, H_LONG."""
     w.n_accepted += 1
     if w.defect >= 0.0:
         w.largest_defect = max(w.largest_defect, w.defect)
@@ -130,7 +130,7 @@ def count_step(w, tolerances, control, clock, size, out_step):
     gap = size
     if w.defect >= 0.0:
         gap = min(size, tolerances[DEFECT_GAP])
-    elif is_beyond_gap(tolerances, size):  # only a step with evaluations within it may be longer than GAP
+    elif is_beyond_gap(tolerances, size):  # only steps with evaluations within them may be so long
         gap = control[at.MAX_EVALUATION_GAP] * size
     w.widest_gap = max(w.widest_gap, gap)
     clock[at.H_LONG] = max(size, H_LONG_DECAY * clock[at.H_LONG])
@@ -146,7 +146,7 @@ def count_step(w, tolerances, control, clock, size, out_step):
 FRACTION_OF_MOTION = 0.1
 FRACTION_AT_SIGN_CHANGE = 1e-6  # replaces FRACTION_OF_MOTION if det C_qd (dependent columns of C_q) changes sign
 LEAST = 1e-300  # lower bound of the allowed error of a predicted position, which avoids a division by zero
-FIXED_FRACTION = 0.01  # part of the tolerance by which predictions may differ, even if coordinates hardly move
+FIXED_FRACTION = 0.01  # allowed error of a prediction if coordinates hardly move, relative to the tolerance
 
 
 @merged
@@ -160,9 +160,9 @@ def store_prediction(w, q1):
 def prediction_error(w, tolerances, h, q, v, q1):
     """Return the largest |w.predicted - q1| (dependent positions) / (allowed error), for a step from (q, v) to q1.
 
-    q1 satisfies the constraints; the integration formula predicted w.predicted. The allowed error is the tolerance or,
-    if smaller, about FRACTION_OF_MOTION (if det C_qd changes sign: FRACTION_AT_SIGN_CHANGE) times the displacement.
-    Store the sign of det C_qd at q1 in w.orientation_new, by the factors that `w` must contain. Fixed steps: return 0.
+    The formula predicted w.predicted; q1 satisfies the constraints. The allowed error is the tolerance or, if smaller,
+    about FRACTION_OF_MOTION (if det C_qd changes sign: FRACTION_AT_SIGN_CHANGE) times the largest displacement.
+    w.orientation_new becomes the sign of det C_qd, from its factors in `w`. If steps have a fixed size, only return 0.
     """
     if tolerances[ESTIMATE] == 0.0:
         return 0.0
@@ -183,7 +183,7 @@ def prediction_error(w, tolerances, h, q, v, q1):
 
 @merged
 def project_prediction(f, w, tolerances, t, h, q, v, q1, v1, inner_tol):
-    """Move the predicted (q1, v1) onto the constraints; return DONE or a failure code, and the prediction's error."""
+    """Move the predicted (q1, v1) onto the constraints; return a code, and `prediction_error` (0 after a failure)."""
     store_prediction(w, q1)
     code = restore_constraints(f, w, t, q1, v1, inner_tol)
     return code, prediction_error(w, tolerances, h, q, v, q1) if code == DONE else 0.0
@@ -197,8 +197,8 @@ def defect_ratio(tolerances, h, order, predicted, a, q, v):
     """Return the largest defect |predicted - a| of accelerations at the end (q, v) of a Taylor step of size h.
 
     `predicted`: accelerations by the series; `a`: by the equations. A defect is divided by the allowed defect, which
-    causes an error of one tolerance in q or v. The defect of a series of order `order` grows as the highest power of
-    time: its integral over the step is h / order times its value at the end. Return inf if a value is not finite.
+    causes an error of one tolerance in q or v. The defect of a series of order `order` grows as time^(order - 1), so
+    that its integral over the step is h / order times its value at the end. Return inf if a value is not finite.
     """
     rtol, duration, largest, ratio = tolerances[RTOL], h / order, 0.0, 0.0
     for j in range(a.size):

@@ -8,15 +8,15 @@ begins: the implicit method takes some steps, with its errors multiplied by ten,
 
 A trial also begins at smaller h rho in three cases:
 
-- rho is far above the rate at which the motion changes: a component that decays at the rate rho may limit h;
-- velocities of vibrations at the rate rho are a few tolerances at most: steps at the limit cause such vibrations;
-- the whole run is expected to cost a thousand times as much as a trial.
+- rho is far above the rate at which the motion changes: then a component that decays at the rate rho may limit h;
+- vibrations at the rate rho have velocities of at most a few tolerances: steps near the limit excite such vibrations;
+- the whole run is expected to cost as much as a thousand trials.
 
-Unless h rho is far above the limit, a trial waits until the run has cost a few times as much as a trial, or is expected
-to cost ten times as much. Costs are counted in evaluations of the explicit method. With generated code, an evaluation
-of the implicit method counts several times. The explicit method is tried again if h rho is well below the limit, or if
-a second of motion costs more than it did with the explicit method. After an unsuccessful trial, the number of estimates
-before the next trial doubles. In this module, `f` is the kit, and `w` the workspace.
+If h rho is far above the limit, a trial begins whatever the run has cost. Otherwise, it waits until the run has cost as
+much as a few trials, or is expected to cost as much as ten. Costs are counted in evaluations of the explicit method.
+With generated code, an evaluation of the implicit method counts several times. The explicit method is tried again if
+h rho is well below the limit, or if a second of motion costs more than it did with the explicit method. After an
+unsuccessful trial, the number of estimates before the next trial doubles. `f` is the kit, and `w` the workspace.
 
 Kernels call both methods by their addresses, so that each method is compiled in its own module.
 """
@@ -50,25 +50,26 @@ from twoloop.kernels.data.indices import DONE, ESTIMATE, FIXED_ORDER, GAP, MAX_G
 from twoloop.kernels.evaluation.inner_loop import renew_partition
 from twoloop.kernels.linalg.dense import copy
 
-# the largest rate is first estimated after FIRST_ESTIMATE evaluations of the equations, then every BETWEEN_ESTIMATES;
-# these numbers are multiplied by options[COST_RATIO] while the explicit method is active. An estimate takes about eight
+# the largest rate is first estimated after FIRST_ESTIMATE evaluations of the equations, later every BETWEEN_ESTIMATES
+# evaluations. While the explicit method is active, both numbers are multiplied by options[COST_RATIO]
 FIRST_ESTIMATE, BETWEEN_ESTIMATES = 100.0, 600.0
 N_POWER_ITERATIONS = 4  # power iterations by dF/dq in an estimate (F: accelerations), and at most this number by dF/dv
-NEGLIGIBLE_DAMPING = 1e-3  # power iterations by dF/dv end early if the eigenvalue times the step size is below this
+NEGLIGIBLE_DAMPING = 1e-3  # power iterations by dF/dv (F: acceleration) end if eigenvalue * step size is below this
 ZERO_REPLACEMENT = 1e-3  # replaces zero components of the vector of a power iteration, whose largest component is 1
-STABILITY_LIMIT = 3.0  # a trial begins at any cost if step size * (largest rate) / (stability limit) exceeds this
-# if Jacobians are computed by finite differences (about eight evaluations per coordinate), a trial that STABILITY_LIMIT
-# does not require also waits until the run has cost this number of evaluations per independent coordinate
+URGENT_RATIO = 3.0  # no cost delays a trial (it is urgent) if step size * (largest rate) / stability limit exceeds this
+# if Jacobians are computed by finite differences (about eight evaluations per coordinate), a trial that is not urgent
+# (see URGENT_RATIO) also waits until the run has cost this number of evaluations per independent coordinate
 MIN_COST_PER_COORDINATE = 64.0
 TRIAL_COST = 300.0  # approximate cost of a trial of the implicit method, in evaluations of the implicit method
-MIN_COST_IN_TRIALS = 3.0  # a trial that STABILITY_LIMIT does not require waits until the run has cost this many trials
+MIN_COST_IN_TRIALS = 3.0  # a trial that is not urgent (URGENT_RATIO) waits until the run has cost this number of trials
 COUNTED_FRACTION_OF_RUN = 0.3  # the cost so far counts as at least this fraction of the expected cost of the whole run
-# when the run has cost this number times MIN_COST_IN_TRIALS trials, a trial begins, however small the largest rate is;
-# after k trials, when the run has cost k + 1 times as much
+# however small the largest rate is, a first trial begins when the run has cost as much as
+# COST_OF_ANY_TRIAL * MIN_COST_IN_TRIALS trials. After k trials, the next one begins at k + 1 times this cost
 COST_OF_ANY_TRIAL = 100.0
-MIN_RATIO_TO_MOTION = 30.0  # above this times `_motion_rate`, the largest rate is "hidden": the motion does not show it
+MIN_RATIO_TO_MOTION = 30.0  # the largest rate is far above `_motion_rate` if it exceeds this times `_motion_rate`
 QUIET_FACTOR = 10.0  # vibrations count as small if their velocities are at most this number of tolerances
-# least step size * (largest rate) / (stability limit) for a trial because the motion hardly shows the largest rate
+# small vibrations, or a largest rate far above `_motion_rate`, are reasons for a trial only if step size *
+# (largest rate) / (stability limit) exceeds this
 MIN_HIDDEN_RATIO = 0.05
 DIFFERENCE_STEP = 1e-4  # time step of the finite difference in `_motion_rate`, relative to 1 / (largest rate)
 RETURN_BELOW = 0.4  # the explicit method is tried again if step size * (largest rate) / (stability limit) is below this
@@ -83,8 +84,8 @@ N_ESTIMATES_AFTER_SUCCESS = 4.0  # number of estimates of the largest rate from 
 # BACK_ON_TRIAL: the explicit method is on trial, after the implicit method was in use
 EXPLICIT, ON_TRIAL, IMPLICIT, BACK_ON_TRIAL = range(4)
 
-# `options` begins with N_PAIR options of the pair, at the indices below. Then follow N_OF_EACH numbers for each method,
-# parameters of step-size control (loop_state.py) and, at REUSE_OF, w.reuse; then the options of both methods.
+# `options` begins with N_PAIR options of the pair, at the indices below. N_OF_EACH numbers of each method follow: the
+# parameters of step-size control (loop_state.py) and, at REUSE_OF, `Plan.reuse`. The options of both methods come last.
 # - LIMIT: stability limit of step size * (largest rate). After N_ESTIMATES estimates above LIMIT, a trial begins
 # - MATRIX_COST: cost of a Jacobian, in evaluations of accelerations
 # - COST_RATIO: cost of an evaluation by the second (implicit) method, in evaluations by the first (explicit) one
@@ -93,11 +94,11 @@ LIMIT, N_ESTIMATES, MATRIX_COST, COST_RATIO, SIZE_1, N_PAIR = range(6)
 REUSE_OF, N_OF_EACH = N_RULE, N_RULE + 1
 N_OPTIONS = N_PAIR + 2 * N_OF_EACH  # index in `options` where the options of the first method begin
 
-# indices of the first N_SCALARS numbers in `memory`; then two vectors (n_q) of power iterations, by dF/dq and by dF/dv,
-# and the memories of both methods
+# indices of the first N_SCALARS numbers in `memory`. The vectors (n_q each) of the power iterations by dF/dq and dF/dv
+# (F: accelerations) follow, then the memories of both methods
 (
-    PHASE,  # method in use or on trial: EXPLICIT, ON_TRIAL, IMPLICIT or BACK_ON_TRIAL
-    STEPS,  # number of accepted steps in this phase
+    PHASE,  # which method is in use or on trial: EXPLICIT, ON_TRIAL, IMPLICIT or BACK_ON_TRIAL
+    STEPS,  # number of accepted steps since PHASE, the method in use or on trial, last changed
     MAY_ESTIMATE,  # 1: the largest rate may be estimated, as the last attempted step was accepted; 0: it was rejected
     NEXT_ESTIMATE,  # number of evaluations since the start of the run after which the largest rate is estimated again
     ESTIMATES_TO_WAIT,  # number of estimates of the largest rate that must still follow before the next trial may begin
@@ -108,12 +109,13 @@ N_OPTIONS = N_PAIR + 2 * N_OF_EACH  # index in `options` where the options of th
     RATE,  # last estimate of the largest rate of the motion (1/s)
     FIRST_MEMORY,  # length of the memory of the first method
     H_MEAN,  # weighted mean of the last step sizes (s), see MEAN_WEIGHT
-    HISTORY,  # first of two entries with the history of step-size control (see loop_state.py) in this phase
-    _HISTORY_ERROR,
+    HISTORY,  # size (s) of the last accepted step
+    _HISTORY_ERROR,  # error of the last accepted step, in tolerances; 0: PHASE has changed since that step
     H_TRIED,  # size of the last attempted step (s)
     ERROR_TRIED,  # error of the last attempted step, in tolerances
     N_TRIALS,  # number of trials so far
-    # number of estimates of step size * (largest rate) above LIMIT; a lower estimate resets it if a trial could begin
+    # number of estimates of step size * (largest rate) above LIMIT. A lower estimate sets the number to 0, unless the
+    # run has cost too little for a trial
     N_ABOVE_LIMIT,
     N_SCALARS,
 ) = range(19)
@@ -131,9 +133,9 @@ def switching_options(
     """Return the array `options` of a pair of methods, the first one explicit, the second one implicit.
 
     `limit`, `estimates`, `matrix_cost` and `ratio` are the values of LIMIT, N_ESTIMATES, MATRIX_COST and COST_RATIO.
-    `rules` has a row for each method: parameters of step-size control and w.reuse. `first`, `second`: options.
+    `rules` has a row of N_OF_EACH numbers (see LIMIT) for each method. `first` and `second`: the methods' own options.
     """
-    first = np.asarray(first)  # numbers or, for code that is compiled for all parameters, expressions of parameters
+    first = np.asarray(first)  # contains numbers or, in code for all parameters, expressions of parameters
     scalars = [limit, float(estimates), matrix_cost, ratio, float(first.size)]
     return np.concatenate([scalars, np.asarray(rules, dtype=np.float64).ravel(), first, np.asarray(second)])
 
@@ -202,7 +204,7 @@ def _largest_rate(f, w, memory, t, state, new_state):
     by_q, by_v = memory[N_SCALARS : N_SCALARS + n], memory[N_SCALARS + n : N_SCALARS + 2 * n]
     Q, V, A = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n]
     growth_by_q = growth_by_v = 0.0
-    # generated code does not use the partition: an old one may have independent coordinates that hardly move
+    # generated code does not renew the partition, whose independent coordinates may hardly move now: choose a new one
     is_explicit = memory[PHASE] == EXPLICIT
     if is_explicit and f.is_generated == 1 and renew_partition(f, w, t, state[:n]) != DONE:
         return 0.0
@@ -259,7 +261,7 @@ def _has_small_vibrations(w, tolerances, state, rate):
 
 @compiled
 def _cost_of_run(w, options):
-    """Return the cost of the run so far, in evaluations of the equations; a Jacobian counts as options[MATRIX_COST]."""
+    """Return the cost of the run so far in evaluations of the equations; a Jacobian costs options[MATRIX_COST]."""
     return w.n_evaluations + options[MATRIX_COST] * w.n_jacobians
 
 
@@ -277,7 +279,7 @@ def _evaluations_between_estimates(options, memory):
 
 @compiled
 def _begin_phase(w, options, memory, phase, t):
-    """Update `memory` for a `phase` that begins at t: clear the history of errors, and begin to measure costs."""
+    """Update `memory` for a `phase` that begins at t: set the error of the last step to 0, begin to measure costs."""
     memory[PHASE] = phase
     memory[STEPS] = 0.0
     memory[HISTORY + ERROR_BEFORE] = 0.0
@@ -303,7 +305,7 @@ def _judge_trial(w, options, memory, t):
 
 @compiled
 def _phase_to_begin(f, w, options, memory, tolerances, t, state, new_state):
-    """Estimate the largest rate; return ON_TRIAL or BACK_ON_TRIAL if such a trial must begin, else -1."""
+    """Estimate the largest rate. If a trial must begin, return its phase, ON_TRIAL or BACK_ON_TRIAL, otherwise -1."""
     n = w.Q.size
     memory[RATE] = _largest_rate(f, w, memory, t, state, new_state)
     cost_per_second, cost = _cost_per_second(w, options, memory, t), _cost_of_run(w, options)
@@ -315,8 +317,8 @@ def _phase_to_begin(f, w, options, memory, tolerances, t, state, new_state):
         memory[N_ABOVE_LIMIT] += 1.0
     if memory[ESTIMATES_TO_WAIT] > 0.0:
         return -1
-    # unless h_rho exceeds STABILITY_LIMIT, a trial begins only if it is cheap compared with `counted`: the cost of the
-    # run so far or, if larger, a fraction of the expected cost of the whole run
+    # `counted` is the cost of the run so far or, if larger, a fraction of the expected cost of the whole run. Unless a
+    # trial is cheap compared with `counted`, it begins only if h_rho exceeds URGENT_RATIO
     counted, min_cost = cost, MIN_COST_IN_TRIALS * TRIAL_COST * options[COST_RATIO]
     if np.isfinite(tolerances[GAP]):
         counted = max(counted, COUNTED_FRACTION_OF_RUN * tolerances[GAP] / MAX_GAP_RATIO * cost_per_second)
@@ -329,16 +331,13 @@ def _phase_to_begin(f, w, options, memory, tolerances, t, state, new_state):
         is_hidden = _has_small_vibrations(w, tolerances, state, memory[RATE])
         if not is_hidden:
             is_hidden = memory[RATE] > MIN_RATIO_TO_MOTION * _motion_rate(f, w, t, state, memory[RATE], Q, V, A)
-    # a costly run starts a trial at any largest rate: friction is stiff only while it reverses, and few estimates fall
-    # into this time. The condition cost > min_cost excludes short steps at the start, which make a run look costly
+    # a costly run starts a trial however small the largest rate is: friction is stiff only while it reverses, and few
+    # estimates fall into this time. Short steps at the start make a run look costly: so require cost > min_cost
     is_costly = is_cheap and cost > min_cost and counted > COST_OF_ANY_TRIAL * min_cost * (1.0 + memory[N_TRIALS])
     is_due = (
-        h_rho > STABILITY_LIMIT
-        or is_hidden
-        or is_costly
-        or (memory[N_ABOVE_LIMIT] >= options[N_ESTIMATES] and is_cheap)
+        h_rho > URGENT_RATIO or is_hidden or is_costly or (memory[N_ABOVE_LIMIT] >= options[N_ESTIMATES] and is_cheap)
     )
-    if is_cheap and h_rho <= 1.0:  # if a trial is not cheap, N_ABOVE_LIMIT is kept, for a trial later
+    if is_cheap and h_rho <= 1.0:  # otherwise, keep N_ABOVE_LIMIT, which may start a trial later
         memory[N_ABOVE_LIMIT] = 0.0
     is_expensive = cost_per_second > MIN_GAIN * memory[COST_PER_SECOND]  # more than with the explicit method
     if (memory[PHASE] == EXPLICIT and is_due) or (memory[PHASE] == IMPLICIT and (h_rho < RETURN_BELOW or is_expensive)):
@@ -367,7 +366,7 @@ def commit_switching(f, w, options, memory, tolerances, accepted):
 
 @kernel(ATTEMPT)
 def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """Attempt a step by the active method; but first begin or end a trial of the other method, if it is due.
+    """Begin or end a trial of the other method if that is due; then attempt a step by the active method.
 
     A trial begins or ends only after accepted steps, and never with steps of fixed size. The memory of a method is set
     to zero when the method becomes active. Each method has its own parameters of step-size control.
@@ -378,7 +377,7 @@ def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
         memory[T_BEGIN], memory[COST_BEGIN] = t, _cost_of_run(w, options)
         memory[NEXT_ESTIMATE] = w.n_evaluations + FIRST_ESTIMATE * options[COST_RATIO]
     if memory[MAY_ESTIMATE] == 1.0 and tolerances[ESTIMATE] == 1.0:
-        phase = -1  # phase that begins now; -1: the present phase continues
+        phase = -1  # new value of memory[PHASE]; -1: the value remains
         if memory[PHASE] == ON_TRIAL or memory[PHASE] == BACK_ON_TRIAL:
             phase = _judge_trial(w, options, memory, t)
         elif w.n_evaluations >= memory[NEXT_ESTIMATE]:
@@ -396,14 +395,14 @@ def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
     w.reuse = max(rule[REUSE_OF], w.rounded)
     if is_explicit:
         code, error, factor = f.attempt_first(f, w, options[N_OPTIONS:begin], first, t, h, tolerances, state, new_state)
-        # a step of fixed size that does not converge cannot be shortened: repeat it by the implicit method, now in use
+        # a step of fixed size that does not converge cannot be shortened: switch to the implicit method, and repeat it
         if code == OUTER_DIVERGED and tolerances[ESTIMATE] == 0.0 and f.form != FIXED_ORDER:
             _begin_phase(w, options, memory, IMPLICIT, t)
             second[:] = 0.0
             w.explicit_step = 0.0
             code, error, factor = f.attempt_second(f, w, options[begin:], second, t, h, tolerances, state, new_state)
     else:
-        # only the first method evaluates the equations within steps: only its steps may be longer than tolerances[GAP]
+        # the second method does not evaluate the equations within its steps: reject steps longer than tolerances[GAP]
         ratio = gap_ratio(tolerances, h)
         if ratio > 0.0:
             return Attempt(DONE, ratio, 1.0 / ratio)

@@ -3,12 +3,12 @@
 An offset is an index in this array, which begins at an aligned address. Quantities at the nodes of a step are stored
 as LANES numbers side by side, one for each node after the beginning. The ends of up to LANES successive steps are
 projected onto the constraints together: their quantities are stored as LANES numbers, one for each step. A sweep is one
-iteration for all stages. Only coordinates on which, or on whose velocities, accelerations depend are iterated.
+iteration for all stages. Coordinates are iterated only if accelerations depend on them or their velocities.
 """
 
 LANES = 8  # number of values, one in each SIMD lane, that are computed at once
 ORDER = 12.0  # the error estimate of a step is proportional to this power of the step size
-MAX_ROUNDING = 1e-13  # a difference of two values up to this fraction of the values may be a rounding error
+MAX_ROUNDING = 1e-13  # a difference of two values may be a rounding error if it is at most this fraction of them
 # results of the iteration for the stages. REJECTED: no convergence, or the error is too large. GUESSED: the step size
 # was only a guess, and another one must be tried. NOT_COMPUTED: accelerations at the nodes could not be computed
 CONVERGED, REJECTED, GUESSED, NOT_COMPUTED = range(4)
@@ -21,15 +21,15 @@ CONVERGED, REJECTED, GUESSED, NOT_COMPUTED = range(4)
     DEGREE,  # degree of the polynomial that predicts the accelerations in this step
     PREDICTS,  # 1: a polynomial predicts the accelerations in this step; 0: they are predicted to be constant
     CURRENT,  # index, 0 or 1, of the stored polynomial that belongs to the last accepted step
-    TRIED,  # 1: the stored polynomial with the index 1 - CURRENT belongs to the attempted step; 0: it is not in use
+    TRIED,  # 1: of two stored polynomials, the one that is not CURRENT belongs to the step just attempted; 0: to none
     NEXT_DEGREE,  # degree of the polynomial that will predict the accelerations in the next step
-    OLD_DEGREE,  # value of DEGREE before a step was rejected; the next accepted step restores it; 0: none was rejected
-    MAY_GUESS,  # 1: the step size is a guess, replaced if the iteration converges too fast or slowly; 0: it is final
-    N_MASS_FIRST,  # number of next steps in which elimination begins with the mass matrix, after another order failed
+    OLD_DEGREE,  # value of DEGREE before a rejected step; the next accepted step restores it; 0: nothing to restore
+    MAY_GUESS,  # 1: the step size is a guess, replaced if RHO is not from FAST_START to SLOW_START; 0: it is final
+    N_MASS_FIRST,  # number of steps left in which elimination begins with the mass matrix, as a pivot was too small
     N_GUESSES,  # number of guesses of the first step size so far
     N_STEPS,  # number of accepted steps since the method began
-    LIMITED,  # counter, shows stiffness: +1 for a step whose size the convergence limited; -1 for others, down to 0
-    FAILURES,  # counter, shows stiffness: +2 for a step that did not converge; -1 for an accepted step, down to 0
+    LIMITED,  # counter of stiffness: a step whose size the convergence limits adds 1; others subtract 1, down to 0
+    FAILURES,  # counter of stiffness: a step that does not converge adds 2; an accepted step subtracts 1, down to 0
     DEFECT,  # largest defect of the accelerations between nodes, relative to the allowed defect; -1: not evaluated
     RHO,  # contraction: ratio of the changes of velocities by the last sweep (iteration) and by the one before
     SWEEPS,  # number of sweeps (iterations for all stages) that the step took
@@ -42,13 +42,13 @@ CONVERGED, REJECTED, GUESSED, NOT_COMPUTED = range(4)
     FACTOR_OF_DEFECT,  # largest ratio of the next step size to this one that the defect allows
     ALLOWED_H,  # largest size (s) with which the last step would have satisfied the error test
     SIZE,  # largest |v| + H |a| (H: step size) where the step begins, relative to tolerances: scale of rounding errors
-    STRICTER,  # factor that makes the iteration stricter: (largest WEIGHTS) / (largest WEIGHTS of iterated coordinates)
+    STRICTER,  # factor on the changes by a sweep: (largest of all WEIGHTS) / (largest WEIGHTS of iterated coordinates)
     REPEATS,  # 1: each sweep (iteration) evaluates accelerations at old, then again at new velocities; 0: only once
 ) = range(29)
 # offsets of arrays that follow the single numbers
 POWERS = 32  # index of the first of eight numbers: powers 1 to 8 of (size of this step / size of the step before)
-SCALED = 40  # index of the first of eight coefficients of the polynomial that predicts an acceleration, times POWERS
-MOVED = 48  # index of the first of eight numbers, one for each projected end of a step: last max|correction of q|
+SCALED = 40  # index of the first of eight products: (coefficient of the predicting polynomial) * (number in POWERS)
+MOVED = 48  # index of the first of eight numbers, one for each end of a step: max|dq|, where dq is the last correction
 VALID = 56  # index of the first of eight numbers, one for each end of a step: 1 if its projection converged, else 0
 DEFECTS = 64  # index of the first of eight numbers, one for each of successive steps: DEFECT of the step
 WEIGHTS = 72  # index of the first of n_q numbers, one for each coordinate: 1 / (allowed error of its velocity)

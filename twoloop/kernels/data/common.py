@@ -54,17 +54,17 @@ class Work(NamedTuple):
     augmented: Any  # view, as one vector, of the constraint Jacobian G followed by the mass matrix M
     S: Any  # (r_v, r_v) Schur complement G M^-1 G^T (G: independent rows of the constraint Jacobian), then its factors
     W: Any  # (r_v, n_q) G M^-1 (G: independent rows of the constraint Jacobian; M: mass matrix)
-    A: Any  # (n_dof, n_dof) reduced mass matrix T^T M T (T: null space of G), then its factors; empty where S is used
+    A: Any  # (n_dof, n_dof) T^T M T (T: null space of G), then its factors; empty unless the null-space form is used
     MT: Any  # (n_q, n_dof) mass matrix times T, whose columns are the null space of the constraint Jacobian
     # null space of G: row j contains the dependent velocities (in order of elimination) if independent velocity j is 1
     # and the others are 0. Last row: dependent velocities due to drives (C_t and b) if all independent ones are 0
-    D: Any  # (n_dof + 1, r_v) null space of the constraint Jacobian G; last row: velocities due to drives
+    D: Any  # (n_dof + 1, r_v) dependent velocities per unit of each independent one; last row: those due to drives
     Gx: Any  # (n_c + n_a, n_q) constraint Jacobian at a displaced position; scratch for full pivoting
     G_of_S: Any  # (n_c + n_a, n_q) if M is constant: the G for which S and W were computed; NaN: S and W are invalid
     pattern: Any  # (n_c + n_a, n_q) 1 for entries of the constraint Jacobian that have been nonzero in the run, else 0
     mass_pattern: Any  # (n_q, n_q) 1 for entries of M that have been nonzero, else 0; only in the form AUGMENTED
-    row_entries: Any  # indices in this array: where the list of nonzero columns of each row of G begins; then the lists
-    Gamma_tried: Any  # (2, n_c + n_a) Gamma by finite differences: with twice the time step; with the one tried before
+    row_entries: Any  # for each row of G, index in this array at which its list of nonzero columns begins; lists follow
+    Gamma_tried: Any  # (2, n_c + n_a) Gamma by differences: row 0 with 2 * time step, row 1 with the previous time step
     rates: Any  # (13, n_c + n_a) constraint rates C_t and b at 13 times within a step, see discontinuities.py
     changes: Any  # (N_CHANGES, n_q + n_c + n_a) samples of forces and constraint rates, see discontinuities.py
     Q: Any  # (n_q) generalized forces
@@ -89,7 +89,7 @@ class Work(NamedTuple):
     values_v: Any  # factors of G_d, the dependent columns of the constraint Jacobian G
     index_a: Any  # list of operations that factors the augmented matrix [M G^T; G 0]; index_a[SIZE] = 0: no list yet
     values_a: Any  # factors of the augmented matrix; empty in other forms than AUGMENTED
-    right: Any  # (2 (n_q + r_v)), r_v: rank of G. First half: right-hand side for the augmented matrix; then scratch
+    right: Any  # (2 (n_q + r_v)) right-hand side for the augmented matrix; the second half is scratch (r_v: rank of G)
     order: Any  # (n_q) scratch: order of the columns in full pivoting
     row_order: Any  # (n_c + n_a) scratch: order of the rows in full pivoting
     counters: Any  # (N_COUNTERS) numbers of steps, iterations, evaluations etc. in the run, see indices.py
@@ -102,14 +102,14 @@ class Work(NamedTuple):
     mass_values: Any  # nonzero entries of M, in the order of linalg/symbolic_factorization.py
     jacobian_values: Any  # nonzero entries of C_q, in the order of linalg/symbolic_factorization.py
     is_independent: Any  # (n_c) 1 for independent rows of C_q, 0 for redundant rows
-    factors: Any  # entries of the factors of the augmented matrix, at the indices that f.ldl_program contains
+    factors: Any  # factors of the augmented matrix; f.ldl_program contains the index of each entry
     pivot_sizes: Any  # (n_q + n_c) squared norms of rows, to which the pivots are compared, see linalg/sparse_ldl.py
     unknowns: Any  # (n_q + n_c) right-hand side when a solver is called, solution when it returns
     solutions: Any  # (3 (n_q + n_c)) scratch; then (n_c) a number s for each row g of C_q: s g^T g is added to M
 
     sizes: Any = None  # the numbers that determine the sizes of all arrays, see `Sizes` in layout.py
-    address: Any = 0  # address of `table` in memory, which kernels receive as their argument `w`
-    table: Any = None  # addresses and shapes of the arrays above
+    address: Any = 0  # address of the field `table` in memory; kernels receive this address as their argument `w`
+    table: Any = None  # addresses and shapes of all arrays of the workspace
 
 
 _INTEGER_FIELDS = {
@@ -148,9 +148,9 @@ class Attempt(NamedTuple):
 
 
 class Step(NamedTuple):
-    """Compiled functions of a method: `attempt` computes a step; `commit` saves or discards its data in `memory`.
+    """Compiled functions of a method: `attempt` computes a step, `commit` saves or discards the step's data.
 
-    `many` takes several steps in one call, and accepts or rejects them itself; None: the method has no such function.
+    `many` takes several steps in one call, and accepts or rejects each step itself. It is None if a method lacks it.
     """
 
     attempt: Any = None
@@ -190,16 +190,16 @@ KIT.add_function("attempt_many", MANY)
 OWN_FUNCTIONS = {
     # functions of a state: arguments (t, q, v, f.numbers), then the arrays of results that the comments name
     "own_accelerate": types.boolean(f8, VECTOR, VECTOR, VECTOR, VECTOR),  # store accelerations
-    "own_correct_positions": types.boolean(f8, VECTOR, VECTOR, VECTOR, VECTOR, VECTOR),  # store correction of q, new q
-    "own_project": types.boolean(f8, *[VECTOR] * 8),  # store accelerations, correction of q, new q and v, multipliers
+    "own_correct_positions": types.boolean(f8, VECTOR, VECTOR, VECTOR, VECTOR, VECTOR),  # store change of q and new q
+    "own_project": types.boolean(f8, *[VECTOR] * 8),  # store accelerations, change of q, new q, new v, multipliers
     "own_redundant": types.boolean(f8, VECTOR, VECTOR, VECTOR, VECTOR),  # return True if redundant rows are satisfied
     # functions of collocation steps; `memory` is described in data/collocation.py, `numbers` is f.own_numbers
     "attempt_nodes": f8(*[VECTOR] * 4),  # (memory, state, tolerances, numbers): solve for stages; return a code
     "audit_nodes": f8(*[VECTOR] * 3),  # (memory, state, numbers): return the largest defect between nodes; -1: failure
     "retry_nodes": types.none(*[VECTOR] * 2),  # (memory, state): predict a shorter step from a rejected one
     "end_nodes": types.none(*[VECTOR] * 3),  # (memory, state, new_state): compute the state at the end of the step
-    "correct_ends": types.none(*[VECTOR] * 2),  # (memory, numbers): move the ends of eight steps towards C = 0
-    "project_ends": types.none(*[VECTOR] * 2),  # (memory, numbers): project ends of eight steps; compute a, lam
+    "correct_ends": types.none(*[VECTOR] * 2),  # (memory, numbers): move the ends of 8 steps at once towards C = 0
+    "project_ends": types.none(*[VECTOR] * 2),  # (memory, numbers): project the ends of 8 steps at once; find a, lam
 }
 KIT.add_llvm_functions(OWN_FUNCTIONS)
 
@@ -290,13 +290,12 @@ def _helper_decorator(**options: Any) -> Callable[[Callable[..., Any]], Dispatch
     return njit(**{**OPTIONS, **wrappers, "pipeline_class": HelperCompiler, **options})
 
 
-# numba passes the flags of a function on to the functions that it calls. So each decorator sets forceinline: else all
-# helpers that a helper with forceinline=True calls would also be copied into their callers
+# numba passes the flags of a helper on to all helpers that it calls. Calls from a helper with forceinline=True would
+# thus be inlined, too, if the decorators of the called helpers did not set forceinline
 exact = _helper_decorator(fastmath=False, forceinline=False)  # keeps the order of floating-point operations
 compiled = _helper_decorator(forceinline=False)  # compiled as a function, which LLVM inlines only if it is short
 inlined = _helper_decorator(inline="always")  # inlined by numba; only a helper of this kind can return views of arrays
-# for helpers that are short, or used in every evaluation: LLVM replaces each call by a copy of the helper's code
-merged = _helper_decorator(forceinline=True)
+merged = _helper_decorator(forceinline=True)  # for short or frequent helpers: LLVM copies their code into the callers
 
 
 NO_NUMBERS = np.zeros(0)  # value of Kit.numbers if no generated function reads data
@@ -305,10 +304,10 @@ NO_NUMBERS = np.zeros(0)  # value of Kit.numbers if no generated function reads 
 class Kit:
     """Functions and data of a system and a method, passed to kernels as one reference.
 
-    `functions`: callbacks and data of the system. `inner`: the inner loop, which may call functions generated for the
-    mechanism (`own`; (): none). `general`: the inner loop for any mechanism, which does what generated code cannot do.
-    `step`: functions of the method; None: no kernel calls them. `first`, `second`: functions of two methods between
-    which the run may switch. `numbers`: data for generated functions of a state; `own_numbers`: for collocation steps.
+    `functions`: callbacks and data of the system. `own`: functions generated for the mechanism, if any. `inner`: the
+    inner loop, which may call `own`. `general`: the inner loop for any mechanism, for what generated code cannot do.
+    `step`: functions of the method, or None if no kernel calls them. `first`, `second`: functions of two methods
+    between which the run may switch. `numbers`, `own_numbers`: data of generated functions of states, collocation.
     """
 
     def __init__(
@@ -374,7 +373,7 @@ def finite(A):
 
 @compiled
 def not_finite(w, kind, t, q):
-    """Record t and the index `kind` of the callback that returned NaN or infinity (-1: q has); return NOT_FINITE."""
+    """Record t and `kind`, the callback that returned NaN or infinity (-1 if q is not finite); return NOT_FINITE."""
     w.fault_kind = kind if finite_vector(q) else -1.0
     w.fault_time = t
     return NOT_FINITE
@@ -421,11 +420,11 @@ def smallest_size(tolerances):
 
 @merged
 def typical_size(tolerances, x):
-    """Return the size that smaller components of x (q or v) count as in comparisons: 1, or less if all of x is small.
+    """Return the typical size of x (q or v): max|x_k|, at least `smallest_size`, at most 1; or 1 if x and atol are 0.
 
-    For a mechanism of 1e-9 m, a displacement by 1e-7 m would be too long, and a correction of 1e-14 m too large. But x
-    may be rounding errors, as velocities at rest are; so the size is not below `smallest_size`, at which the absolute
-    tolerance begins to count.
+    Smaller components count as this size. If it were 1 for a mechanism of 1e-9 m, finite differences would displace q
+    by 1e-7 m, and a correction of 1e-14 m would count as rounding. As x may be rounding errors, such as velocities at
+    rest, the size is at least `smallest_size`, where the absolute tolerance begins to count.
     """
     size = smallest_size(tolerances)
     for k in range(x.size):
@@ -435,10 +434,10 @@ def typical_size(tolerances, x):
 
 @merged
 def max_change_by_rounding(limit, change, change_q, change_v, size_q, size_v):
-    """Return the largest relative change in an iteration that may be due to rounding.
+    """Return the limit up to which the relative change in an iteration, `change`, may be due to rounding.
 
-    `change` is the larger one of change_q / size_q and change_v / size_v. Changes may be due to rounding if they are at
-    most `limit`, relative to the larger one of the size and 1.
+    `change` is the larger one of change_q / size_q and change_v / size_v. It may be due to rounding if
+    change_q / max(size_q, 1) and change_v / max(size_v, 1) are at most the argument `limit`.
     """
     rounded = max(change_q / max(size_q, 1.0), change_v / max(size_v, 1.0))
     return limit * (change / rounded) if rounded > 0.0 else limit

@@ -28,10 +28,10 @@ from twoloop.kernels.compile.callbacks import OPTIONAL_KINDS
 (
     CONSTANT_MASS,  # 1: the mass matrix M is constant; 0: it varies
     DIAGONAL_MASS,  # 1: the mass matrix M is diagonal; 0: it may have other entries
-    BANDWIDTH,  # bandwidth of the mass matrix if it is factored as a banded matrix; -1: it is not
+    BANDWIDTH,  # bandwidth of the mass matrix if it is factored as a banded matrix; -1: no banded factors
     FORM,  # algebra that solves for accelerations and multipliers: MULTIPLIERS, NULL_SPACE, AUGMENTED or FIXED_ORDER
-    DENSE_FORM,  # value of FORM that replaces AUGMENTED if the sparse factors have too many entries
-    IS_GENERATED,  # 1: the inner loop is code generated for the mechanism; 0: it is the one for any mechanism
+    DENSE_FORM,  # value that FORM gets instead of AUGMENTED if the sparse factors exceed the limits in markowitz_lu.py
+    IS_GENERATED,  # 1: the inner loop is code generated for the mechanism; 0: it is general code for any mechanism
     FIRST_GIVEN,  # index of the first flag of an optional callback, see GIVEN
 ) = range(7)
 MULTIPLIERS, NULL_SPACE, AUGMENTED, FIXED_ORDER = range(4)  # values of FORM, see saddle_point.py, sparse_inner_loop.py
@@ -50,7 +50,7 @@ FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN, REACTION_BY_Q_GIVEN, MASS_VALUES_GIVEN = (
     N_OUTER,  # number of iterations of the outer loop, each of which evaluates all stages of a step
     N_INNER,  # number of iterations of the inner loop, which moves positions onto the constraints
     N_EVALUATIONS,  # number of solutions of the equations for accelerations
-    N_PARTITIONS,  # number of choices of dependent coordinates (fixed-order form: of independent rows)
+    N_PARTITIONS,  # how often dependent coordinates (fixed-order form: independent rows) have been chosen
     N_FACTORIZATIONS,  # number of factorizations of matrices
     N_JACOBIANS,  # number of evaluations of the derivatives of accelerations, for Newton's method in the outer loop
     N_COUNTERS,
@@ -67,20 +67,20 @@ FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN, REACTION_BY_Q_GIVEN, MASS_VALUES_GIVEN = (
     GAMMA_STEP_RATIO,  # time step of finite differences for Gamma, relative to the result of `largest_difference_step`
     GAMMA_ACCURACY,  # error of Gamma, relative to GAMMA_SCALE, when GAMMA_STEP_RATIO was chosen last
     GAMMA_SCALE,  # size to which errors of Gamma are compared: largest |entry| of Gamma, or sum of |G_ij a_j|, so far
-    REUSE,  # after a correction of positions of at most this size, the Jacobian is not evaluated and factored again
-    ROUNDED,  # rounding error of positions; replaces REUSE for states at the ends of steps
+    REUSE,  # the inner loop keeps C_q and its factors after a correction of positions of at most this size
+    ROUNDED,  # rounding error of positions; at ends of steps, C_q is kept only after a correction of at most this size
     GENERATION,  # number of partitions so far: a change of this number shows that the partition has changed
     RANK,  # rank of C_q, stored only if the workspace was allocated for another rank (code RANK_DIFFERS)
     RANK_V,  # rank of [C_q; A], stored together with RANK
     CONTRADICTION,  # with the code ROWS_CONTRADICT: index of a violated row of [C_q; A]
-    # smallest pivot of C_q, computed last (rows scaled to maxima of 1; fixed-order form: sine of an angle between rows)
+    # smallest pivot in the last elimination of C_q, with rows scaled to maxima of 1; fixed-order form: sqrt(SMALLEST)
     PIVOT,
-    # 1: the run has come near a singular position, or never checks this; 2: it is near, stages are projected; 0: else
+    # 1: a singular position was near, or the method never checks for one; 2: one is near, stages are projected; 0: else
     NEARLY_SINGULAR,
     NEAR_NOW,  # 1: a singular position was near at the last check; 2: the next check chooses a new partition; 0: else
     MASS_SCALE,  # factor by which M is multiplied in the augmented matrix, see linalg/saddle_point.py
     FACTORED,  # 1: the factors of the equations for accelerations belong to w.M and w.G; 0: M or G has changed since
-    HAS_GAMMA,  # 1: w.Rate and w.Gamma[:n_c] are those of the present state, from the callback `kinematics`; 0: else
+    HAS_GAMMA,  # 1: the callback `kinematics` has computed w.Rate and w.Gamma[:n_c] at the present state; 0: it has not
     USED_GENERAL,  # 1: the general inner loop computed the last projected state; 0: generated code did
     EXPLICIT_STEP,  # 1: with a pair of methods (stiffness.py), the last attempted step was explicit; 0: else
     DEFECT,  # largest defect of accelerations in the attempted step, relative to the allowed defect; -1: not evaluated
@@ -89,7 +89,7 @@ FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN, REACTION_BY_Q_GIVEN, MASS_VALUES_GIVEN = (
     WIDEST_GAP,  # longest time (s) between two evaluations of the equations within accepted steps
     LAST_JUMP,  # time (s) of the last known jump of a constraint rate (C_t, b); -infinite: none
     NEXT_JUMP,  # time (s) of the next known jump of a constraint rate (C_t, b), or end of the run; infinite: unknown
-    # largest |coefficient| of independent rows in a redundant row, at the first check of this partition; 0: unknown
+    # largest |coefficient| of redundant rows as sums of independent rows, at this partition's first check; 0: unknown
     MAX_COEFFICIENT,
     SMALLEST,  # fixed-order form: smallest sine^2 of an angle between rows of C_q; negative: M is not positive definite
     TIME_IS_UP,  # 1 (set by another thread): the time limit has passed, and evaluations return STOPPED; 0: not yet
@@ -114,7 +114,7 @@ FLAGS = _group("CONSTANT_MASS", "FIRST_GIVEN") | {f"{kind}_given": index for kin
     LEAST,  # the smaller one of the relative tolerance and the smallest absolute tolerance
     GAP,  # longest allowed time (s) between two evaluations of the equations
     DEFECT_GAP,  # longest allowed time (s) between two evaluations in steps that evaluate their defect between nodes
-    ATOL,  # index of the first absolute tolerance; there is one for each coordinate and its velocity
+    ATOL,  # index of the first absolute tolerance; each coordinate has one, which applies to its velocity, too
 ) = range(6)
 MAX_GAP_RATIO = 0.01  # tolerances[GAP] (longest allowed time between two evaluations) / duration of the run
 REPORTED_ERROR = 30.0  # near a singular position, velocity errors above this number of tolerances are reported

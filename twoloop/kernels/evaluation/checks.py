@@ -105,10 +105,10 @@ def column_units(matrix, typical, columns, mask, logs, rows, scratch):
 def linear_ranges(coordinates_in_units, radius, negligible, scratch, ranges):
     """Store in `ranges` how far coordinates can move, in their units, before each row of C_q changes much.
 
-    Row i of `coordinates_in_units` contains |q_j| in its unit where row i of C_q has a nonzero entry j, else 0.
-    `radius`: norm of each row / change of the row per unit displacement. A radius of at most 1, or at most the largest
-    |q_j| of the row, is the range. For larger radii, the range is the lower median of those |q_j| of the row that
-    exceed NEGLIGIBLE times the largest one; or 1, if no |q_j| of the row exceeds the argument `negligible`.
+    Entry (i, j) of `coordinates_in_units` is |q_j| in its unit if row i of C_q has a nonzero entry j, else 0. `radius`:
+    norm of each row / change of the row per unit displacement. If the radius is at most 1, or at most the largest |q_j|
+    of the row, it is the range. If not, the range is the lower median of the |q_j| of the row that exceed NEGLIGIBLE
+    times the largest one; but if no |q_j| of the row exceeds the argument `negligible`, the range is 1.
     """
     for i in range(ranges.size):
         largest, n = 0.0, 0
@@ -130,7 +130,7 @@ def linear_ranges(coordinates_in_units, radius, negligible, scratch, ranges):
 # CONSISTENT: the state satisfies the constraints up to rounding. Only for a varying M, with L = roundings[2] max|M_ij|:
 # DEFINITE if all eigenvalues of M exceed L * EIGENVALUE_MARGIN; INDEFINITE if one is below L / EIGENVALUE_MARGIN
 WELL_FORMED, CONSISTENT, DEFINITE, INDEFINITE = 1, 2, 4, 8
-MAX_RELATIVE_DISTANCE = 0.5  # recorded sizes of coordinates hold at q if |q_j - recorded q_j| / size_j is at most this
+MAX_RELATIVE_DISTANCE = 0.5  # sizes recorded at a position p are used at q if all |q_j - p_j| are at most this * size_j
 ROUNDING_OF_ZERO = 2.0**-52  # a coordinate up to this fraction of the largest one may be zero with a rounding error
 EIGENVALUE_MARGIN = 2.0  # if the least eigenvalue of M is within this factor of its limit, a check in Python decides
 
@@ -220,8 +220,8 @@ def _index_of_near_position(q, rows, n_c, records):
 def _is_consistent(C, rate, rows, q, v, records, tolerance):
     """Return True if (q, v) satisfies the constraints up to rounding errors; `rows`: [C_q; A], `rate`: C_t and b.
 
-    A violation is compared with the terms of the constraint. In these terms, a coordinate counts as at least its size
-    in `records` (see `evaluate_start`), and at least the rounding error of the largest coordinate. Else a constraint
+    The violation of a constraint is compared with its terms. In the terms, the size of a coordinate in `records` (see
+    `evaluate_start`), or the rounding error of the largest coordinate, replaces a smaller |q_j|. Otherwise constraints
     on coordinates that are zero up to rounding, such as those normal to a plane of motion, would seem violated.
     """
     fastest, rounding = largest_of(v), ROUNDING_OF_ZERO * largest_of(q)
@@ -317,7 +317,7 @@ def evaluate_start(f, t, q, v, records, lam, results, mass, rows, shifts, patter
         result_flags = WELL_FORMED
         if _is_consistent(results[force:C], results[C:rate], rows, q, v, records, roundings[0]):
             result_flags |= CONSISTENT
-    if f.constant_mass == 0:  # if the least eigenvalue is within EIGENVALUE_MARGIN of the limit, set neither flag
+    if f.constant_mass == 0:  # neither DEFINITE nor INDEFINITE is set if the least eigenvalue is close to its limit
         if _is_definite(mass, EIGENVALUE_MARGIN * roundings[2], scratch):
             result_flags |= DEFINITE
         elif not _is_definite(mass, roundings[2] / EIGENVALUE_MARGIN, scratch):
@@ -363,9 +363,9 @@ def _is_close(fused, separate, tolerance, rounding_errors):
 def kinematics_agree(f, t, q, v, fused, separate, roundings, tolerance, rounding):
     """Return True if the callback `kinematics` agrees with the separate callbacks for C, C_t, gamma and C_q.
 
-    Differences of up to `tolerance` times the largest value of each of the four are allowed; for C_i, also `rounding`
-    times the sum of |C_q[i, j] q_j| over j. On return, `fused` (by `kinematics`) and `separate` (by the others) contain
-    C, C_t, gamma and C_q. Both (3 + n_q, n_c) and `roundings` (n_c, scratch) are zero on entry.
+    In each of these, differences may be up to `tolerance` times the largest value; for C_i, `rounding` times the sum of
+    |C_q[i, j] q_j| over j is added. On entry, `fused`, `separate` (3 + n_q, n_c) and `roundings` (n_c, scratch) are 0.
+    On return, `fused` contains C, C_t, gamma and C_q by `kinematics`, and `separate` those by the separate callbacks.
     """
     n, n_c = q.size, roundings.size
     fused_rows, separate_rows = fused[3:].reshape((n_c, n)), separate[3:].reshape((n_c, n))

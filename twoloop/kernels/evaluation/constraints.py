@@ -2,7 +2,7 @@
 
 C_q belongs to constraints C(t, q) = 0, A to constraints A v + b = 0, so that G v + (C_t, b) = 0. The derivative of this
 equation along the motion is G a = Gamma for accelerations a. Two central differences, with the time steps e and 2 e,
-yield Gamma to order 4. The difference of the two estimates the error, by which e is chosen. `f`: kit, `w`: workspace.
+yield Gamma to order 4. The deviation between them estimates the error, by which e is chosen. `f`: kit, `w`: workspace.
 """
 
 import numpy as np
@@ -27,7 +27,7 @@ def constraint_rows(f, w, t, q, G):
 def clear_rows(f, w):
     """Set the constraint Jacobian w.G to zero; in the augmented form, only its nonzero entries, see w.row_entries."""
     if f.form == AUGMENTED:
-        for i in range(w.Rate.size):  # the task VERIFY_PATTERN detects nonzero entries elsewhere
+        for i in range(w.Rate.size):  # other entries are zero: the task VERIFY_PATTERN detects any that are not
             for k in range(w.row_entries[i], w.row_entries[i + 1]):
                 w.G[i, w.row_entries[k]] = 0.0
     else:
@@ -85,7 +85,7 @@ def gather_independent_columns(G, rate, rows, independent, D):
 # `largest_difference_step` returns at most MAX_DIFFERENCE_STEP (s), and at least MIN_STEP_RATIO * MAX_DIFFERENCE_STEP
 MAX_DIFFERENCE_STEP, MIN_STEP_RATIO = 2e-4, 1e-4
 N_DIFFERENCE_STEPS = 12  # number of time steps that `_choose_difference_step` tries, each a quarter of the previous one
-# if Gamma with the time step e differs from Gamma with 2 e by at most this part of its size, rounding may be the reason
+# Gamma with the time step e may always differ from Gamma with 2 e by this part of its size: rounding may be the reason
 ROUNDING_DISAGREEMENT = 1e-9
 # if Gamma with the time step e differs from Gamma with 2 e by less than this part of its size, e is doubled
 NEGLIGIBLE_DISAGREEMENT = 1e-11
@@ -117,7 +117,7 @@ def largest_difference_step(q, v):
 
 @merged
 def _difference_side(w, t, e):
-    """Return the side of t on which to take differences: 0 (both) or, if C_t or b jumps near t, 1 (after t) or -1."""
+    """Return the side of t for differences: 0 (both) or, if C_t or b jumps near t, 1 (after t) or -1 (before t)."""
     since_jump, until_jump = t - w.last_jump, w.next_jump - t
     if min(since_jump, until_jump) >= 2.0 * e:
         return 0.0
@@ -128,8 +128,8 @@ def _difference_side(w, t, e):
 def _fill_gamma(f, w, t, q, v, e, first, last):
     """Store Gamma[first:last] in w.Gamma, extrapolated from differences with the time steps e and 2 e.
 
-    Return the largest |Gamma_i|, the largest |difference| of Gamma_i with both time steps, and the largest |G_ij v_j|
-    (G: constraint Jacobian). If Gamma is not finite, the first two results are NaN.
+    Return the largest |Gamma_i|, the largest |difference| between Gamma_i with e and with 2 e, and the largest
+    |G_ij v_j| (G: constraint Jacobian). If Gamma is not finite, the first two results are NaN.
     """
     Gamma_coarse = w.Gamma_tried[0]
     side = _difference_side(w, t, e)
@@ -171,7 +171,7 @@ def _fill_gamma(f, w, t, q, v, e, first, last):
 
 @merged
 def _max_disagreement(w):
-    """Return how much Gamma with the time step e may differ from Gamma with 2 e; the error of Gamma is less."""
+    """Return the allowed difference of Gamma with the time steps e and 2 e; the error of Gamma is less than this."""
     return max(w.gamma_required, ROUNDING_DISAGREEMENT) * w.gamma_scale
 
 
@@ -179,9 +179,9 @@ def _max_disagreement(w):
 def _choose_difference_step(f, w, t, q, v, largest_step, first, last):
     """Store Gamma[first:last] in w.Gamma, by differences with the best of several time steps e.
 
-    Beginning with `largest_step`, divide e by 4 until Gamma changes little. The best e is the one with the least change
-    of Gamma. Store its ratio to `largest_step` in w.gamma_step_ratio. Return GAMMA_INACCURATE if even the least change
-    exceeds the allowed error, else DONE.
+    Beginning with `largest_step`, divide e by 4 until the change of Gamma is small (CONVERGED_CHANGE). The best e is
+    the one with the least change. Store its ratio to `largest_step` in w.gamma_step_ratio. Return GAMMA_INACCURATE if
+    even the least change exceeds the allowed error, else DONE.
     """
     least_change = np.inf
     step_ratio = 1.0
@@ -221,7 +221,7 @@ def gamma_by_differences(f, w, t, q, v, first, last):
     if e > 0.0:
         largest, disagreement, terms = _fill_gamma(f, w, t, q, v, e, first, last)
         if np.isnan(largest) or disagreement == 0.0 or w.gamma_scale == 0.0:
-            return DONE  # accept a NaN (the caller reports it), a zero error, and any error if no scale is known
+            return DONE  # accept NaN (the caller reports it), a zero error, and any error while w.gamma_scale is 0
         rounding = ROUNDING_OF_TERMS * terms / largest_step
         w.gamma_scale = max(w.gamma_scale, largest, rounding / w.gamma_required)
         if disagreement < NEGLIGIBLE_DISAGREEMENT * w.gamma_scale:

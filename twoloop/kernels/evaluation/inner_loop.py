@@ -104,7 +104,7 @@ def factor_equations_at(f, w, t, q):
 
 @merged
 def compute_accelerations(f, w, t, q, v, a):
-    """Store accelerations at (q, v) in `a`, with factors by `_factor_rows_at` in w; return DONE or a failure code."""
+    """Store accelerations at (q, v) in `a`, given factors of the Jacobian in w; return DONE or a failure code."""
     w.n_evaluations += 1
     code = factor_equations_at(f, w, t, q)
     if code == DONE:
@@ -199,9 +199,9 @@ def project_state(f, w, t, q, v, theta, a, lam):
     """Project (q, v) onto the constraints; store accelerations `a` and multipliers lam; return DONE or a failure code.
 
     q and v change in place. Corrections x of q satisfy A x = 0, where A are the rows of non-holonomic constraints.
-    The last iteration corrects q by at most theta, and v by at most theta max(1, max|v|), or it corrects q by at most
-    theta * w.pivot; w.pivot is the smallest pivot of C_q. In the latter case, v is accurate, too: per unit of
-    displacement, the directions that constraints allow turn by about 1 / w.pivot at most.
+    Iterations end when they correct q by at most theta, and v by at most theta max(1, max|v|). They also end when they
+    correct q by at most theta * w.pivot (smallest pivot of C_q). Then v is accurate, too: over a displacement d, the
+    directions that constraints allow turn by at most about d / w.pivot.
     """
     last_correction = np.inf
     theta = max(theta, MIN_CORRECTION * w.rounded)
@@ -247,7 +247,7 @@ ROUNDING_OF_Q = 2e-14  # a change of q by at most this fraction of max|q| counts
 def _verify_pattern(w):
     """If the constraint Jacobian w.G has nonzero entries where w.pattern is 0, write new programs of elimination.
 
-    Return DONE if w.G has no such entry, INNER_DIVERGED after new programs, to repeat the step, or SINGULAR on failure.
+    Return DONE if w.G has no such entry, INNER_DIVERGED (repeat the step) after new programs, or SINGULAR on failure.
     """
     if not record_entries(w):
         return DONE
@@ -307,14 +307,14 @@ def inner_loop(f, w, task, t, q, v, tolerance, a, lam):
 def evaluate(f, w, t, q, v, tolerance, a):
     """Compute dependent from independent entries of q and v, and the accelerations `a`; return DONE or a failure code.
 
-    Newton's method for q ends after a correction of at most `tolerance`; if it is at most w.reuse, keep the Jacobian.
+    If the last correction of q, at most `tolerance`, exceeds w.reuse, the Jacobian is evaluated again at the end.
     """
     return f.inner(f, w, tasks.EVALUATE, t, q, v, tolerance, a, w.lam)
 
 
 @merged
 def evaluate_state(f, w, t, q, v, tolerance, a, lam):
-    """Compute dependent entries of q and v up to rounding, as at ends of steps, and `a` and lam; return a code."""
+    """Compute a state at the end of a step: dependent entries of q and v up to rounding, `a` and lam; return a code."""
     return f.inner(f, w, tasks.EVALUATE_STATE, t, q, v, tolerance, a, lam)
 
 
@@ -341,7 +341,7 @@ def restore_constraints(f, w, t, q, v, tolerance):
 
 @merged
 def accelerations(f, w, t, q, v, a, lam):
-    """Store accelerations `a` and multipliers lam at (q, v), just computed by `restore_constraints`; return a code."""
+    """Store accelerations `a` and multipliers lam at a state (q, v) from `restore_constraints`; return a code."""
     return f.inner(f, w, tasks.ACCELERATIONS, t, q, v, 0.0, a, lam)
 
 
@@ -365,7 +365,7 @@ def prepare_mass(f, w, t, q):
 
 @merged
 def renew_partition(f, w, t, q):
-    """Choose a partition at a consistent q, and store sign(det C_qd) (dependent columns of C_q) in w; return a code."""
+    """At a consistent q, choose a partition, and store sign(det C_qd) (C_qd: dependent columns) in w; return a code."""
     return f.inner(f, w, tasks.RENEW_PARTITION, t, q, q, 0.0, w.x, w.lam)
 
 

@@ -50,7 +50,7 @@ def result_of_operation(kind, x, y):
 
 @exact
 def affine_sum(nodes, table, columns, numbers, coefficients, constant, begin, end):
-    """Return an argument of an operation: numbers[constant] plus terms number `begin` to end - 1, see `run_table`."""
+    """Return an argument of an operation: numbers[constant] plus the terms begin, ..., end - 1, see `run_table`."""
     total = numbers[constant]
     for k in range(begin, end):
         total = total + numbers[coefficients + k] * nodes[int(table[columns + k])]
@@ -62,7 +62,7 @@ def run_table(table, rows, n_rows, columns, numbers, coefficients, constants, no
     """Do the operations of a program: store t, q, v in `nodes` from index `inputs` on, then the results of operations.
 
     The vector `table` (integers, or floats without a fraction) contains a row for each operation, from index `rows` on,
-    and for each term the index of its number in `nodes`, from index `columns` on. The vector `numbers` contains the
+    and for each term the index of the node that it multiplies, from index `columns` on. The vector `numbers` contains
     coefficients of terms from index `coefficients` on, and two constants for each row from index `constants` on.
     """
     nodes[inputs] = t
@@ -79,7 +79,7 @@ def run_table(table, rows, n_rows, columns, numbers, coefficients, constants, no
 
 @exact
 def _run_program(program, numbers, nodes, t, q, v):
-    """Run a program that replaces a callback: store t, q, v and results in `nodes`; `numbers`: constants it uses."""
+    """Run a program that replaces a callback: store t, q, v and results in `nodes`; `numbers`: its constants."""
     n_rows = program[N_ROWS]
     columns = N_SIZES + N_COLUMNS * n_rows
     run_table(program, N_SIZES, n_rows, columns, numbers, 2 * n_rows, 0, nodes, 0, t, q, v)
@@ -87,7 +87,7 @@ def _run_program(program, numbers, nodes, t, q, v):
 
 @exact
 def _result_indices(program):
-    """Return the number of results, the index of the first in `nodes`, and of the list of outputs in `program`."""
+    """Return the number of results, the index of the first in `nodes`, and where `program` lists output indices."""
     n = program[N_RESULTS]
     return n, program[N_NODES] - n, N_SIZES + N_COLUMNS * program[N_ROWS] + program[N_TERMS]
 
@@ -109,7 +109,7 @@ def gamma_by_program(f, w, t, q, v):
 
 @compiled
 def jacobian_by_program(f, w, t, q, G):
-    """Store C_q in G (zero on entry) by a traced program; return False without a program, or for non-finite values."""
+    """Store C_q in G (zero on entry) by a traced program; return False if there is none, or a value is not finite."""
     program = f.jacobian_program
     if program.size == 0:
         return False

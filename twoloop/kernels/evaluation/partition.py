@@ -38,7 +38,7 @@ from twoloop.kernels.linalg.markowitz_lu import (
 
 RANK_TOLERANCE = 1e-11  # a pivot, or the ratio of the smallest to the largest pivot, counts as zero up to this limit
 PARTITION_CHANGED = -1  # return code: the task succeeded, as for DONE, and the partition has changed
-MAX_ROWS_ELIMINATED = 200  # with more independent constraints, `min_pivot_ratio` does no elimination, to save time
+MAX_ROWS_ELIMINATED = 200  # with more independent rows than this, `min_pivot_ratio` returns the last pivot to save time
 # a partition is poor if the sensitivity of dependent to independent coordinates exceeds its first value by this factor
 SENSITIVITY_GROWTH = 3.0
 
@@ -109,9 +109,9 @@ def full_pivoting(A, order, row_order, row_maxima, first, last, max_rank):
 def min_pivot_ratio(f, w, t, q):
     """Return the ratio of the smallest to the largest pivot of [C_q; A] at (t, q), to detect singular positions.
 
-    A: rows of the non-holonomic constraints. The ratio is 0 if the rank is lower than before. Rows are not scaled,
-    because scaling would hide that a row has a small norm at a singular position. In the fixed-order form, or with more
-    than MAX_ROWS_ELIMINATED rows, return w.pivot to save time: the smallest pivot of the last factors or partition.
+    A: rows of the non-holonomic constraints. The ratio is 0 if the rank is below that of the partition. Rows
+    are not scaled: this would hide small norms of rows at a singular position. In the fixed-order form, or with more
+    than MAX_ROWS_ELIMINATED rows, return the smallest pivot of the last factors or partition instead, to save time.
     """
     if f.form == FIXED_ORDER or w.rows_v.size > MAX_ROWS_ELIMINATED:
         return w.pivot
@@ -153,7 +153,7 @@ def _find_pivot_order(w, max_rank, max_rank_v):
     w.pivot = abs(G[rank - 1, rank - 1]) if rank > 0 else 1.0
     if n_rows == n_c:
         return rank, rank
-    last = rank  # rows before this index may get pivots: the loop exchanges rows of A with redundant rows of C_q
+    last = rank  # pivots are chosen in the first `last` rows: the loop puts rows of A after the independent rows
     for i in range(n_c, n_rows):
         row_order[last], row_order[i] = row_order[i], row_order[last]
         for j in range(G.shape[1]):
@@ -164,7 +164,7 @@ def _find_pivot_order(w, max_rank, max_rank_v):
 
 @compiled
 def smallest_pivot(f, w, t, q):
-    """Return the smallest pivot of C_q at (t, q), with rows scaled to maxima of 1; 0 if the rank has become lower."""
+    """Return the smallest pivot of C_q at (t, q), rows scaled to maxima 1; 0 if the rank is below the partition's."""
     rank = w.rows.size
     if rank == 0:
         return 1.0
@@ -213,7 +213,7 @@ def _adopt_pivot_order(w):
 
 @compiled
 def write_programs(w):
-    """Write programs that factor the dependent columns of the Jacobian w.G; return False if these are singular."""
+    """Write programs that factor dependent columns of the Jacobian w.G; return False if these columns are singular."""
     _record_columns_of_entries(w)
     w.factored = 0.0
     is_regular = make_program(w.G, w.pattern, w.rows, w.dependent, w.index, w.values)
@@ -224,7 +224,7 @@ def write_programs(w):
 
 @compiled
 def _record_columns_of_entries(w):
-    """Store the columns where row i of w.pattern is 1 in w.row_entries[w.row_entries[i] : w.row_entries[i + 1]]."""
+    """Store the columns of ones in row i of w.pattern as w.row_entries[w.row_entries[i] : w.row_entries[i + 1]]."""
     n_rows = w.Rate.size
     index = n_rows + 1
     for i in range(n_rows):
@@ -324,7 +324,7 @@ def choose_oriented_partition(f, w, t, q):
 
 @compiled
 def _largest_coefficient(w):
-    """Return the largest |coefficient| in combinations of independent rows that equal redundant rows (maxima: 1)."""
+    """Express redundant rows by independent rows, all scaled to maxima of 1; return the largest |coefficient|."""
     rows = rows_of(w.index_v)
     largest = 0.0
     begin = 0
@@ -346,8 +346,8 @@ def partition_is_poor(w):
 
     The sensitivity to the independent coordinates is max|C_qd^-1 C_qi| (w.D); C_qd and C_qi are the columns of the
     dependent and the independent coordinates in C_q. The sensitivity is near 1 after full pivoting, and grows without
-    bound where the independent coordinates stop being valid. Also return True if redundant rows
-    have large coefficients of independent rows, which become dependent there while the rank stays the same.
+    bound where the independent coordinates stop being valid. Also return True if the independent rows become dependent
+    while the rank stays the same: redundant rows then have large coefficients as combinations of independent rows.
     """
     largest = 0.0
     for j in range(w.independent_v.size):
@@ -356,8 +356,8 @@ def partition_is_poor(w):
         w.sensitivity = max(largest, 1.0)
     if not largest <= SENSITIVITY_GROWTH * w.sensitivity:
         return True
-    # no coefficient is checked if no row is redundant, nor in the fixed-order form (w.factors not empty), which chooses
-    # other independent rows when its factors show that a row has become dependent
+    # do not check coefficients if no row is redundant, nor in the fixed-order form (w.factors not empty), whose factors
+    # show when independent rows have become dependent and must be replaced
     if w.rows_v.size == w.Rate.size or w.factors.size > 0:
         return False
     coefficient = _largest_coefficient(w)
@@ -485,7 +485,7 @@ def find_null_space(f, w, t, q):
     """Store in w.D how dependent velocities follow from independent ones, by the factors of the Jacobian w.G.
 
     Row j of w.D contains the dependent velocities, without drives, if independent velocity j is 1 and the others are 0.
-    These rows span the null space of w.G. The last row: velocities due to drives if independent velocities are 0.
+    These rows span the null space of w.G. The last row contains dependent velocities due to drives alone.
     """
     if f.kinematics_given == 0 or w.has_gamma == 0.0:
         constraint_rates(f, w, t, q, w.Rate)

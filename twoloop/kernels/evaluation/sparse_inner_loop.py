@@ -7,9 +7,9 @@ with the forms of linalg/saddle_point.py, which methods with a partition always 
 entries of C_q; then no array has n_c times n_q numbers. If they fill dense matrices, the entries are copied.
 
 If rows of G = C_q are redundant, many multipliers lam have the same reactions p = G^T lam. The shortest lam is used. It
-equals G x for some vector x; x and lam solve
+equals G y for some vector y; y and lam solve
 
-    [0  G^T] [ x ]   [p]
+    [0  G^T] [ y ]   [p]
     [G  -1 ] [lam] = [0]
 
 This matrix is singular, because the constraints leave some motion free. If a small positive diagonal matrix W replaces
@@ -65,11 +65,11 @@ from twoloop.kernels.linalg.symbolic_factorization import (
     pivot_order_of,
 )
 
-# pivot / (squared norm of a row of C_q) is sin^2 of the angle of this row to the span of previous rows, metric M^-1
+# in the metric of M^-1, pivot / (squared norm of a row of C_q) is sin^2 of the row's angle to the span of previous rows
 SUSPECT_PIVOT = 1e-6  # up to this squared sine of a row's angle, a pivot may be a rounding error: the row is checked
 MIN_PIVOT = 1e-10  # factors are accurate if pivot / (squared norm of the row) exceeds this for all independent rows
 MAX_DEPENDENT_SINE = 1e-11  # a row is redundant if the sine of its angle to the independent rows' span is at most this
-PROJECT_STAGES = 2.0  # value of w.nearly_singular near singular positions: stages are projected before evaluations
+PROJECT_STAGES = 2.0  # value of w.nearly_singular with which stages are projected before they are evaluated
 # solutions are refined iteratively, once if the smallest pivot / (squared norm of its row of C_q) is at most the first
 # limit, and twice if this ratio is at most the second limit
 REFINE_ONCE_BELOW, REFINE_TWICE_BELOW = 1e-3, 1e-7
@@ -110,8 +110,8 @@ def fill_jacobian_values(f, w, t, q):
 def _factor_entries(f, w, min_sine_square):
     """Factor [M G^T; G 0], G = C_q; return the smallest sin^2 of a row's angle to the span of previous rows of G.
 
-    Rows of G with a sin^2 up to `min_sine_square` are marked as redundant and left out of the factors and the returned
-    minimum. If M is not positive definite, return -1.
+    If the sin^2 of a row is at most `min_sine_square`, mark the row as redundant: neither the factors nor the returned
+    minimum contain it. If M is not positive definite, return -1.
     """
     w.n_factorizations += 1
     stiffness = w.solutions[3 * f.ldl_program[N_PIVOTS] :]
@@ -143,8 +143,8 @@ def factor_equations_at(f, w, t, q):
         return _failure_of_factorization(w, t, q)
     if _count_independent(w.is_independent) == w.rows_v.size:
         return DONE
-    w.n_partitions += 1  # some independent rows have become dependent: search for other rows that replace them
-    code = _choose_rows(f, w, t, q)
+    w.n_partitions += 1
+    code = _choose_rows(f, w, t, q)  # some independent rows have become dependent: find rows that replace them
     return _adopt_rows(w) if code == DONE else code
 
 
@@ -189,7 +189,7 @@ def _sine_to_independent_rows(f, w, row, square):
             x[columns[k]] += w.jacobian_values[k]
     solve_unknowns(f, w, 2)
     rows, columns, _ = mass_entries_of(f.ldl_program)
-    for k in range(rows.size):  # x^T M x: squared norm of the part of the row orthogonal to independent rows
+    for k in range(rows.size):  # part = x^T M x: squared norm of the row's component orthogonal to independent rows
         part += x[rows[k]] * w.mass_values[k] * x[columns[k]]
     return np.sqrt(part / square) if square > 0.0 else 0.0
 
@@ -213,7 +213,7 @@ def _choose_rows(f, w, t, q):
     if not _factor_entries(f, w, SUSPECT_PIVOT) > 0.0:
         return _failure_of_factorization(w, t, q)
     order, n_q = pivot_order_of(f.ldl_program), w.Q.size
-    copy(w.is_independent, w.z)  # w.z: 0 for rows with small pivots, which must be checked
+    copy(w.is_independent, w.z)  # w.z (scratch): 0 for rows with small pivots, which are checked below
     for k in range(order.size):
         row = order[k] - n_q
         if row < 0 or w.z[row] != 0.0:
@@ -244,7 +244,7 @@ def _adopt_rows(w):
 
 @compiled
 def choose_rows(f, w, t, q):
-    """Choose the independent rows of C_q at (t, q); return a code: RANK_DIFFERS if w has space for another rank."""
+    """Choose the independent rows of C_q at (t, q); return a code. RANK_DIFFERS: w was allocated for a wrong rank."""
     w.n_partitions += 1
     fill_mass_values(f, w, t, q)
     fill_jacobian_values(f, w, t, q)
@@ -269,9 +269,9 @@ MAX_SOLUTIONS = 30  # largest number of refinements of the multipliers of least 
 
 @compiled
 def _fill_least_norm_matrix(program, jacobian, n_q, weights, values):
-    """Store [W G^T; G -1], the matrix for multipliers of least norm, in `values`, in the order of the `program`.
+    """Store the matrix [W G^T; G -1] for multipliers of least norm in `values`; W: diagonal, see REGULARIZATION.
 
-    G: constraint Jacobian with the entries `jacobian`; W: diagonal matrix, see REGULARIZATION; `weights`: scratch.
+    G: constraint Jacobian with the entries `jacobian`. The `program` defines the order of `values`; `weights`: scratch.
     """
     rows, columns, slots = jacobian_entries_of(program)
     for j in range(n_q):
@@ -293,10 +293,10 @@ def _fill_least_norm_matrix(program, jacobian, n_q, weights, values):
 
 @compiled
 def _fill_residual(program, jacobian, force, x, r):
-    """Store in r the residual of equations in the module docstring, [p - G^T lam, lam - G y]; return its relative size.
+    """Store in r the residual of the equations for the multipliers of least norm; return its relative size.
 
-    The relative size is max|p - G^T lam| / max|p|. The argument x contains the approximate solution: the vector y, then
-    multipliers lam. p (`force`): the reactions that lam must have; `jacobian`: entries of the constraint Jacobian G.
+    See the module docstring: the residual is [p - G^T lam, lam - G y], its relative size max|p - G^T lam| / max|p|.
+    x: approximate solution [y, lam]. p (`force`): reactions that lam must have. `jacobian`: entries of C_q = G.
     """
     n_q, largest, residual = force.size, 0.0, 0.0
     copy(force, r[:n_q])
@@ -406,7 +406,7 @@ def _compute_accelerations(f, w, t, q, v, a):
 
 @compiled
 def _compute_multipliers(f, w, lam):
-    """Store in lam the multipliers w.z or, if rows are redundant, the multipliers of least norm; return a code."""
+    """Copy the multipliers in w.z to lam; if rows are redundant, reduce lam to the least norm; return a code."""
     copy(w.z, lam)
     return least_norm(f, w, lam) if w.rows_v.size < lam.size else DONE
 
@@ -469,8 +469,8 @@ def _project_state(f, w, t, q, v, tolerance):
         is_last = is_last or correction_q <= w.pivot * tolerance
         if not is_last and correction_q > CONTRACTION * last_correction:
             limit = ROUNDING_OF_CORRECTIONS * largest_of(q)
-            # corrections do not become smaller: succeed only if the present one may be due to rounding. It is then not
-            # applied, because rounding errors would move light bodies much more than heavy ones
+            # corrections do not become smaller. If this correction may be due to rounding, return DONE without applying
+            # it, because rounding errors would move light bodies much more than heavy ones
             return (
                 DONE
                 if correction_q <= limit or (correction_q <= AMPLIFICATION * limit and _is_on_constraints(f, w, q))

@@ -1,1 +1,1 @@
-"""Runs of one mechanism, one in each SIMD lane: layout of memory, integration loop, and a module for each method."""
+"""Several runs of one mechanism at once, each in its own SIMD lane: memory, integration loop, a module per method."""

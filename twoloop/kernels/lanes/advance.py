@@ -102,7 +102,7 @@ def _count_evaluations(settings, work, n_evaluations):
     for k in range(LANES):
         if work[at.RUNNING * LANES + k] == 1.0:
             n_within = settings[at.N_EVALUATIONS] + int(work[at.EVALUATED * LANES + k])
-            n_evaluations[int(work[at.RUN * LANES + k])] += n_within + 1  # the last one is at the end of the step
+            n_evaluations[int(work[at.RUN * LANES + k])] += n_within + 1  # + 1: the evaluation at the end of the step
 
 
 @compiled

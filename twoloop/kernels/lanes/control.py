@@ -23,12 +23,12 @@ from twoloop.kernels.lanes.layout import (
 )
 
 # indices in `options`, after the N_RULE numbers of the step-size rule; the method's options begin at index N_HEAD
-# - JUMP_RATIO: assumed largest ratio of true error to error estimate in a step in which a force jumps
+# - JUMP_RATIO: (true error) / (error estimate) is assumed to be at most this in steps in which a force jumps
 # - FIRST: first step size, relative to the shortest time scale of the motion at the start
 # - LEAST: the smaller one of the tolerances rtol and atol
 JUMP_RATIO, FIRST, LEAST, N_HEAD = range(N_RULE, N_RULE + 4)
 
-SUDDEN_ERROR = 10.0  # a rejected step with a larger error, in tolerances, is assumed to contain a jump of a force
+SUDDEN_ERROR = 10.0  # a rejected step with an error above this (in tolerances) is assumed to contain a jump of a force
 MAX_RATIO_AFTER_REJECTION = 0.95  # largest ratio of the next step size to a rejected step size
 # if a step would end before t1 by at most this fraction of the time left, the step is lengthened to end at t1
 END_ROUNDING = 1e-10
@@ -37,7 +37,7 @@ END_ROUNDING = 1e-10
 LIMIT_FACTOR = 0.7
 LIMIT_MEMORY = 10.0
 LEAST_FIRST_STEP = 20.0 * at.SHORTEST  # lower bound of the first step size, relative to |t0|
-MAX_REJECTED = 30  # a run with more successive rejected steps leaves its lane, because the motion may be stiff
+MAX_REJECTED = 30  # a run with more than this number of rejected steps in a row leaves its lane, as it may be stiff
 MAX_STEPS = 100_000  # largest number of steps of a run in a lane: the user cannot interrupt runs in lanes
 
 
@@ -68,7 +68,7 @@ def _first_step_size(options, control, work, n, state, a, k):
 
 @compiled
 def begin_control(options, control, work, n, state, a, start):
-    """In lanes that begin a run, initialize step-size control, and copy accelerations from offset `a` to `start`."""
+    """In lanes that begin a run, initialize step-size control; copy accelerations from offset `a` to offset `start`."""
     for k in range(LANES):
         if work[at.IS_NEW * LANES + k] == 1.0:
             for j in range(n):
@@ -82,7 +82,7 @@ def begin_control(options, control, work, n, state, a, start):
 
 @merged
 def _round_steps(work, control):
-    """Round H, the step sizes, so that steps end at floating-point times: else states and times of long runs drift."""
+    """Round the step sizes H so that T + H has no rounding error: else times and states of long runs drift apart."""
     for k in range(LANES):
         h, t = work[at.H * LANES + k], work[at.T * LANES + k]
         if h != control[at.T1] - t:
@@ -91,10 +91,10 @@ def _round_steps(work, control):
 
 @compiled
 def choose_steps(work, control, status, n_steps):
-    """Store the size of the next step, at most control[GAP] (s), in H and X; set ACTIVE to 1 in lanes with a run.
+    """Store the size of the next step, at most control[GAP] (s), in H; set ACTIVE to 1 in lanes with a run.
 
-    Remove a run if its steps are too short, or if it has taken MAX_STEPS steps. In lanes without a run, H, X and ACTIVE
-    become 0.
+    X, the time from the beginning to the end of the step, becomes H. Remove a run if it has taken MAX_STEPS steps, or
+    if H is at most SHORTEST * max(|t|, |t1|). In lanes without a run, H, X and ACTIVE become 0.
     """
     t1 = control[at.T1]
     for k in range(LANES):
@@ -129,11 +129,11 @@ def set_end(work, control):
 
 @compiled
 def end_steps(code, settings, control, work, predicted_v):
-    """Project NEW, the state at the end of the step, onto the constraints; raise ERROR, the error estimate of the step.
+    """Project NEW, the state at the end of the step, onto the constraints; include this change in the estimate ERROR.
 
-    The projection shows two more errors: the largest change of a velocity, in tolerances, and PREDICTION_ERROR, which
-    measures the change of positions. ERROR becomes the largest of the three numbers. So a step is rejected if a drive
-    has a jump or kink between stages, which the method's estimate does not show. `predicted_v`: offset of scratch.
+    Changes by the projection show two errors: the largest change of a velocity, in tolerances, and PREDICTION_ERROR,
+    which measures the change of positions. ERROR becomes the largest of these and the method's error estimate. So a
+    step is rejected if a drive has a jump or kink that the stages miss. `predicted_v`: offset of scratch.
     """
     n, order = settings[at.N], settings[at.ORDER]
     state, new, predicted, _, _, _, _, _ = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])
@@ -183,9 +183,9 @@ def _accept_or_shorten(options, work, k):
 
 @compiled
 def judge_steps(options, work, n, a, start, status):
-    """Set ACCEPTED to 1 in lanes whose step succeeded with a small error; copy accelerations in these lanes to `start`.
+    """Set ACCEPTED to 1 in lanes whose step is accepted, else to 0; remove runs with too many rejected steps in a row.
 
-    In other lanes, count the rejected steps; remove a run after more than MAX_REJECTED. `a`, `start`: offsets.
+    Too many: more than MAX_REJECTED. In lanes with ACCEPTED = 1, copy accelerations from offset `a` to `start`.
     """
     for k in range(LANES):
         work[at.ACCEPTED * LANES + k] = 0.0
@@ -202,7 +202,7 @@ def judge_steps(options, work, n, a, start, status):
 
 
 def memory_size(s: int, n: int) -> int:
-    """Return the length of the memory of an explicit method, in vectors, for s stages and n coordinates."""
+    """Return the number of vectors of LANES numbers in the memory of an explicit method: s stages, n coordinates."""
     return (at.SLOPES + s) * n
 
 
@@ -239,13 +239,13 @@ def step_by_series(code, settings, control, options, work, status, n_steps, with
             work[at.X * LANES + k] = work[at.X * LANES + k] / work[at.UNIT * LANES + k]
         code.evaluate_series(order, control, work)
         return
-    for k in range(LANES):  # remove runs with too many steps: stiff motion may need many at any tolerance
+    for k in range(LANES):  # remove runs after MAX_STEPS steps: stiff motion may need so many at any tolerance
         if work[at.RUNNING * LANES + k] == 1.0 and n_steps[int(work[at.RUN * LANES + k])] >= MAX_STEPS:
             remove_run(work, status, k, at.MANY_STEPS)
     code.compute_series(order, control, work)
     code.choose_sizes(order, control, work)
     _round_steps(work, control)
-    for k in range(LANES):  # store X, and the number of evaluations of the defect within the step
+    for k in range(LANES):  # store X, the step size in units of UNIT, and the number of evaluations added in long steps
         work[at.X * LANES + k] = work[at.H * LANES + k] / work[at.UNIT * LANES + k]
         if work[at.ACTIVE * LANES + k] == 1.0 and work[at.H * LANES + k] > control[at.GAP]:
             work[at.EVALUATED * LANES + k] = np.ceil(work[at.H * LANES + k] / control[at.GAP]) - 1.0

@@ -22,8 +22,8 @@ UNDECIDED, ENDED = 0, 1  # status of a run: UNDECIDED if it has not ended yet, E
     NO_START,  # the generated code could not compute the accelerations at the start
     NO_STATE,  # a state at an output time could not be projected
     NO_VALUES,  # accelerations are not finite, or the generated code is not valid, at a state in a step
-    MANY_REJECTIONS,  # too many successive steps were rejected
-    MANY_STEPS,  # the run takes too many steps
+    MANY_REJECTIONS,  # more successive steps were rejected than allowed, or steps became too short (SHORTEST)
+    MANY_STEPS,  # the run has not ended after MAX_STEPS steps (see control.py)
     CALLBACKS_DIFFER,  # the final state does not satisfy the equations as the user's callbacks evaluate them
 ) = range(-6, 0)
 
@@ -39,9 +39,9 @@ LANES = 8 if has_wide_vectors() else 4  # number of runs at once: the number of 
     X,  # time (s) from the beginning of the step to NEW; during tasks of a Taylor series, in units of UNIT
     ACTIVE,  # 1 in lanes where the next task has to run; a task that fails in a lane stores 0 for this lane
     DEFECT,  # defect at the end of the step, relative to the allowed defect
-    PREDICTION_ERROR,  # difference of predicted and projected positions / its allowed value, see control/step_size.py
+    PREDICTION_ERROR,  # (difference of predicted and projected positions) / (allowed difference), see step_size.py
     LENGTH,  # step size that the last terms of a Taylor series allow, in units of UNIT
-    LONGEST,  # largest step size (s) that a Taylor method allows after the last step
+    LONGEST,  # upper limit of the next step size (s), which Taylor methods compute after each step
     REQUESTED,  # 1 in lanes that begin a run, or whose state at an output time within the step is computed
     WORST_DEFECT,  # largest defect within the step, relative to the allowed defect
     N_REJECTED,  # number of successive rejected steps
@@ -60,8 +60,8 @@ LANES = 8 if has_wide_vectors() else 4  # number of runs at once: the number of 
     JUMP_END,  # time (s) at the end of the last step that was rejected with an error above SUDDEN_ERROR
     SHIFT,  # number from 0 to 1 that shifts the times of evaluations of the defect within a step
     EVALUATED,  # number of evaluations within the step, in addition to settings[N_EVALUATIONS]
-    DISPLACED,  # least size of q (or v) to which displacements in finite differences are relative, see `typical_size`
-    LARGEST,  # largest |component| of the displaced vector, q or v
+    DISPLACED,  # typical size of q (or v): finite differences displace smaller components as if they had this size
+    LARGEST,  # largest |component| of q (or v), which finite differences displace
     PAST,  # size and error of the last accepted step, for step-size control: both of lane 0, then both of lane 1, ...
     _MORE_PAST,
     N_FIELDS,
@@ -79,7 +79,7 @@ ALL_TASKS = (*TASKS, *TASKS_OF_STARTS, *TASKS_OF_STAGES, *TASKS_OF_EXPLICIT, *TA
 CODE.add_llvm_functions(dict.fromkeys(ALL_TASKS, types.none(types.int64, VECTOR, VECTOR)))
 # signature of a method's step (code, settings, control, options, work, status, n_steps, within). In lanes with a run,
 # the function takes a step, sets ACCEPTED, and stores the final state in NEW, accelerations in A, multipliers in LAM.
-# If `within`, no step is taken: NEW becomes the state X s after the beginning of the last accepted step, not projected
+# If `within`, it takes no step: NEW becomes the unprojected state X seconds after the last accepted step began
 STEP = types.void(CODE, INTEGERS, *[VECTOR] * 3, *[INTEGERS] * 2, types.boolean)
 CODE.add_function("step", STEP)
 
@@ -100,7 +100,7 @@ START, BEGIN, _BEGIN_V, PREDICTED_V, SLOPES = range(5)
 # indices in `control`: start T0 and end T1 (s), longest time GAP (s) between evaluations, RTOL, first of n values ATOL
 T0, T1, GAP, RTOL, ATOL = range(5)
 
-SHORTEST = 1e-13  # smallest step size, relative to max(|t|, |t1|); if a step is shorter, the run leaves its lane
+SHORTEST = 1e-13  # smallest step size / max(|t|, |t1|); a run with shorter steps is ended, and repeated outside lanes
 
 
 class LaneKit:
@@ -120,10 +120,10 @@ def _type_of_kit(value: Any, context: Any) -> Any:
 
 
 def array_offsets(n, n_rows, n_numbers):
-    """Return the offsets in `work`, in vectors, of the arrays that follow the fields T, T_NEW, ...
+    """Return the offsets in `work`, in vectors, of the arrays that are stored after the fields (T to PAST).
 
     The arrays are STATE and NEW (q, v); PREDICTED (q before a projection); SERIES_A (accelerations by a Taylor series);
-    A (accelerations) and LAM (multipliers); the data of the generated code (n_numbers); the memory of the method.
+    A (accelerations) and LAM (multipliers); n_numbers coefficients of generated code; the memory of the method.
     """
     state = N_FIELDS
     new = state + 2 * n
@@ -173,7 +173,7 @@ def copy_vectors(work, source, target, count):
 
 @merged
 def _add_product_in_four_lanes(work, t, p, q, sign):
-    """Add sign * work[p] * work[q] to work[t]; do the same for the next three lanes. Read all, then write, for SIMD."""
+    """Add sign * work[p] * work[q] to work[t], also in the next three lanes. For SIMD, all reads precede the writes."""
     t0, t1 = work[t] + sign * work[p] * work[q], work[t + 1] + sign * work[p + 1] * work[q + 1]
     t2, t3 = work[t + 2] + sign * work[p + 2] * work[q + 2], work[t + 3] + sign * work[p + 3] * work[q + 3]
     work[t], work[t + 1], work[t + 2], work[t + 3] = t0, t1, t2, t3
@@ -188,7 +188,7 @@ def add_product(work, target, x, y, sign):
 
 @merged
 def _raised_value(work, target, error, factor, before, after, atol, rtol):
-    """Return max(work[target], error / tolerance) for one lane, see `raise_to_ratio`. `target` to `after`: indices."""
+    """Return max(work[target], ratio) in one lane; see `raise_to_ratio`, whose offsets are indices in `work` here."""
     allowed_error = atol + rtol * max(abs(work[before]), abs(work[after]))
     return max(work[target], abs(work[error]) * work[factor] / allowed_error)
 
@@ -253,10 +253,10 @@ def _pivot_magnitude(work, entry, imaginary, k):
 
 @compiled
 def _choose_pivot(work, matrix, pivots, n, imaginary, c):
-    """In each lane, exchange row c and the row (c or later) with the largest entry in column c; invert this pivot.
+    """In each lane, find the pivot (largest entry of column c from row c on), exchange rows, and invert the pivot.
 
-    Store the latter row's index in `pivots`. If the pivot is zero, set ACTIVE to 0. If `imaginary` > 0, entries are
-    complex, with imaginary parts `imaginary` vectors after the real parts.
+    The pivot's row is exchanged with row c, and its index stored in `pivots`. If the pivot is zero, set ACTIVE to 0. If
+    `imaginary` > 0, entries are complex, with imaginary parts `imaginary` vectors after the real parts.
     """
     for k in range(LANES):
         best, largest = c, _pivot_magnitude(work, matrix + c * n + c, imaginary, k)
@@ -300,7 +300,7 @@ def factor_matrices(work, matrix, pivots, n, imaginary):
 def solve_systems(work, matrix, pivots, n, imaginary, x):
     """Replace a right-hand side x (n) in each lane by the solution, using the factors from `factor_matrices`.
 
-    If `imaginary` > 0, entries are complex: imaginary parts are `imaginary` vectors (of x: n vectors) after real parts.
+    If `imaginary` > 0, entries are complex, see `factor_matrices`; imaginary parts of x are n vectors after real parts.
     """
     imaginary_x = n if imaginary > 0 else 0
     for c in range(n):

@@ -60,17 +60,17 @@ from twoloop.kernels.steps.velocity_errors import LONGEST_GAPS, SLOW_FACTOR, STE
 # indices of blocks of n vectors in the method's memory (n: number of coordinates)
 (
     START,  # accelerations at the beginning of the next step
-    BEGIN_Q,  # q at the beginning of this step; the next two blocks contain v and a at the same time
+    BEGIN_Q,  # q at the beginning of this step; the next two blocks contain v and a there
     BEGIN_V,
     BEGIN_A,
     SUMS,  # scratch
-    MIDDLE_Q,  # q in the middle of the step; the next two blocks contain v and a at the same time
+    MIDDLE_Q,  # q in the middle of the step; the next two blocks contain v and a there
     MIDDLE_V,
     MIDDLE_A,
     E_Q,  # estimated error of q at the end of the step; the next block contains the estimated error of v
     E_V,
-    UNFILTERED,  # estimated error of v before filters
-    FILTERED_ONCE,  # estimated error of v after one filter
+    UNFILTERED,  # estimated error of v before `_filter_errors` is called
+    FILTERED_ONCE,  # estimated error of v after the first call of `_filter_errors`
     COMPLEX,  # scratch: real part of the right-hand side and solution of a linear system
     _IMAGINARY,  # scratch: imaginary part of the right-hand side and solution of a linear system
     N_VECTORS,
@@ -80,13 +80,13 @@ from twoloop.kernels.steps.velocity_errors import LONGEST_GAPS, SLOW_FACTOR, STE
 # - RESIDUAL: residuals of Newton's method; CHANGES: corrections of the accelerations by Newton's method
 STAGES, PREVIOUS, RESIDUAL, CHANGES, N_BLOCKS = range(5)
 # indices of matrices (n, n) in the method's memory. DERIVATIVE_Q, DERIVATIVE_V: derivatives of the accelerations by q
-# and by v. From SYSTEMS on: for each linear system of Newton's method, the real and the imaginary part of its matrix
+# and by v. From SYSTEMS on, the real and imaginary parts of the matrix follow for each linear system of the method
 DERIVATIVE_Q, DERIVATIVE_V, SYSTEMS = range(3)
 
 
 def memory_size(s: int, n: int) -> int:
     """Return the length of the method's memory, in vectors, for s stages and n coordinates."""
-    n_systems = (s + 1) // 2  # a linear system for each complex pair of eigenvalues of the tableau, or real eigenvalue
+    n_systems = (s + 1) // 2  # one linear system for each real eigenvalue and each complex pair of the tableau's matrix
     return N_SINGLE_VECTORS + (N_VECTORS + N_BLOCKS * s + n_systems) * n + s * s + (SYSTEMS + 2 * n_systems) * n * n
 
 
@@ -169,7 +169,7 @@ def _store_typical_size(control, work, n, vector):
 def compute_derivatives(code, settings, control, c, work):
     """Store DERIVATIVE_Q and DERIVATIVE_V, derivatives of accelerations by q and v, in the middle of the step.
 
-    Use the node nearest to the middle, because forces that act only between two nodes must not affect the step.
+    The middle is the node nearest to 1/2, because forces that act only between two nodes must not affect the step.
     """
     n, order = settings[at.N], settings[at.ORDER]
     _, new, _, _, a, _, _, memory = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])
@@ -198,9 +198,9 @@ def compute_derivatives(code, settings, control, c, work):
 
 @compiled
 def factor_systems_of_lanes(settings, method_options, s, work):
-    """Factor the matrices I - (X l)^2 J_q - X l J_v of Newton's method in each lane.
+    """Factor the matrices I - z^2 J_q - z J_v of Newton's method; J_q, J_v: derivatives of accelerations by q, v.
 
-    l: eigenvalue of the tableau's A (one of a complex pair); J_q, J_v: derivatives of a by q and v; X: step size (s).
+    In each lane, z is the step size X (s) times an eigenvalue of the tableau's A (one eigenvalue of a complex pair).
     """
     n = settings[at.N]
     memory = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])[7]
@@ -227,9 +227,9 @@ def factor_systems_of_lanes(settings, method_options, s, work):
 def predict_stages(settings, c, work, begins):
     """Predict the accelerations at the stages, STAGES: evaluate the polynomial through the accelerations in PREVIOUS.
 
-    If X is larger than MAX_STEP_RATIO times the size of the step of PREVIOUS, the polynomial would be extrapolated too
-    far: then all predictions are the accelerations at the beginning of the step. `begins`: 1 if STAGES belong to the
-    step after the step of PREVIOUS, 0 if STAGES belong to the same step.
+    PREVIOUS belongs to the last accepted step. If the new step size X exceeds MAX_STEP_RATIO times the size of that
+    step, the polynomial would be extrapolated too far: then all predictions are the accelerations where the new step
+    begins. `begins`: 1 if the new step follows the accepted step, 0 if it is the first part of the accepted step.
     """
     n = settings[at.N]
     memory = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])[7]
@@ -261,7 +261,7 @@ def predict_stages(settings, c, work, begins):
 
 @compiled
 def _compute_residuals(code, settings, control, A, A2, c, work):
-    """Store accelerations by the equations minus STAGES in RESIDUAL; set SCALE_Q, SCALE_V; on failure, ACTIVE = 0."""
+    """Store RESIDUAL = F - STAGES (F: accelerations by the equations), SCALE_Q, SCALE_V; on failure, ACTIVE = 0."""
     n, order = settings[at.N], settings[at.ORDER]
     _, new, _, _, a, _, _, memory = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])
     s = c.size
@@ -326,7 +326,7 @@ def _correct_stages(settings, method_options, s, work):
 
 @merged
 def _raise_to_largest_value(work, target, begin, n):
-    """In each lane, raise the number at `target` to the largest |value| in n vectors from `begin` on; NaN if one is."""
+    """In each lane, raise the number at `target` to the largest |value|, or a NaN, in the n vectors at `begin`."""
     for i in range(n * LANES):
         magnitude, index = abs(work[begin * LANES + i]), target * LANES + i % LANES
         if magnitude > work[index] or magnitude != magnitude:
@@ -351,7 +351,7 @@ def _store_largest_corrections(settings, A, A2, work):
 
 @merged
 def _has_iteration_ended(options, work, memory, iteration, k):
-    """Set the field DONE to 1 if Newton's iteration in lane k has converged, else to 0; return True if it has ended."""
+    """Set DONE to 1 if Newton's iteration in lane k has converged, else to 0; return True if it converged or failed."""
     x, tolerance = work[at.X * LANES + k], options[N_HEAD + OUTER_TOL]
     scale_q, scale_v = work[(memory + SCALE_Q) * LANES + k], work[(memory + SCALE_V) * LANES + k]
     change_v, change_q = x * work[(memory + LARGEST_V) * LANES + k], x * x * work[(memory + LARGEST_Q) * LANES + k]
@@ -406,7 +406,7 @@ def solve_stages(code, settings, control, options, method_options, A, A2, c, wor
 
 @compiled
 def store_state_from_stages(settings, b, bA, work):
-    """Store in NEW the state X s after the step's beginning; the weights of STAGES are b for v, and bA = b A for q."""
+    """Store in NEW the state at the time X (s) after the step begins; STAGES have weights b for v, bA = b A for q."""
     n = settings[at.N]
     _, new, _, _, _, _, _, memory = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])
     s = b.size
@@ -424,14 +424,14 @@ def store_state_from_stages(settings, b, bA, work):
 
 @merged
 def _allowed_error(control, work, state, new, j, entry, k):
-    """Return atol + rtol * (largest |value| before or after the step) for an entry of the state, of coordinate j."""
+    """Return atol + rtol * max(|value before the step|, |value after it|) for a state entry: q or v of coordinate j."""
     magnitude = max(abs(work[(state + entry) * LANES + k]), abs(work[(new + entry) * LANES + k]))
     return control[at.ATOL + j] + control[at.RTOL] * magnitude
 
 
 @compiled
 def _store_embedded_estimate(settings, method_options, A, work, memory):
-    """Store in E_Q and E_V the errors of q and v that the embedded formula estimates, before filters."""
+    """Store in E_Q and E_V the errors of q and v that the embedded formula estimates, without filters."""
     n, s = settings[at.N], A.shape[0]
     offset = newton_options_index(s)
     gamma0, e = method_options[offset + GAMMA0], method_options[offset + N_EIGEN_SCALARS : offset + N_EIGEN_SCALARS + s]
@@ -442,7 +442,7 @@ def _store_embedded_estimate(settings, method_options, A, work, memory):
         total += e[i]
     for i in range(n * LANES):
         work[e_q * LANES + i] = (gamma0 + total) * work[begin * LANES + i]
-    for j in range(s):  # add the formula's weight e_j times the change of v until stage j, H sum_k A_jk a_k
+    for j in range(s):  # add e_j, the weight of stage j, times H sum_k A_jk a_k, the change of v until the stage
         sum_rows(A[j], stage_rows, vector_range(work, sums, n))
         for i in range(n * LANES):
             work[e_q * LANES + i] += e[j] * work[at.H * LANES + i % LANES] * work[sums * LANES + i]
@@ -455,9 +455,9 @@ def _store_embedded_estimate(settings, method_options, A, work, memory):
 
 @compiled
 def _filter_errors(settings, method_options, s, work, memory):
-    """Filter the estimated errors e = (E_Q, E_V) of q and v, to reduce stiff components: replace e by (I - z J)^-1 e.
+    """Reduce stiff components of the errors e = (E_Q, E_V) of q and v: replace e by (I - z J)^-1 e (J: Jacobian).
 
-    z = gamma0 H (s), with an eigenvalue gamma0 of the tableau; J: derivative of (v, accelerations) by (q, v).
+    z = gamma0 H: step size H (s) times an eigenvalue of the tableau; J: derivative of (v, accelerations) by (q, v).
     """
     n = settings[at.N]
     gamma0 = method_options[newton_options_index(s) + GAMMA0]
@@ -495,7 +495,7 @@ def _filtered_velocity_error(control, work, n, memory, z, state, new, k):
         largest_a = max(largest_a, abs(work[(begin + n + j) * LANES + k]))
         largest_error = max(largest_error, abs(work[(twice + j) * LANES + k]))
         difference = work[(twice + j) * LANES + k] - 2.0 * work[(once + j) * LANES + k] + work[(raw + j) * LANES + k]
-        largest_difference = max(largest_difference, abs(difference))  # |(z J)^2 E_V|; J: see `_filter_errors`
+        largest_difference = max(largest_difference, abs(difference))  # max|(z J)^2 E_V|, see `_filter_errors`
     if largest_error > 0.0:
         work[(memory + DURATION) * LANES + k] = z * np.sqrt(largest_error / largest_difference)
     duration = work[(memory + DURATION) * LANES + k]
@@ -555,7 +555,7 @@ def _add_error_in_slow_directions(settings, control, method_options, s, work):
     solve_systems(work, matrix, pivots, n, 0, e_v)
     for k in range(LANES):
         error = work[error_field * LANES + k]
-        # in unstable motion, the filter may enlarge the error: use the smaller error
+        # in unstable motion, the filter may enlarge the error: use the smaller one of the old and the new error
         if work[at.ACTIVE * LANES + k] == 1.0:
             motion_time = _motion_time(control, work, n, memory, k)
             error = min(error, _velocity_error(control, work, n, e_v, motion_time, state, new, k))
@@ -594,7 +594,7 @@ def _estimate_error(settings, control, method_options, A, work):
 
 @compiled
 def _store_stages(work, memory, n, s):
-    """In lanes with an accepted step, copy STAGES to PREVIOUS, to predict stages for later or intermediate states."""
+    """In lanes with an accepted step, copy STAGES to PREVIOUS, for predictions in the next step and within this one."""
     stages, previous = block_offset(memory, n, s, STAGES), block_offset(memory, n, s, PREVIOUS)
     for k in range(LANES):
         if work[at.ACCEPTED * LANES + k] == 1.0:
@@ -605,7 +605,7 @@ def _store_stages(work, memory, n, s):
 
 @kernel(STEP, vectorized=True)
 def step_by_newton(code, settings, control, options, work, status, n_steps, within):
-    """Take a step of an implicit Runge-Kutta method in each lane, at most as long as control[GAP] (s).
+    """Take a step of an implicit Runge-Kutta method in each lane; its largest size is control[GAP] (s).
 
     If `within`, take no step: compute the states at the time X (s) after the beginning of the last accepted step.
     """

@@ -23,7 +23,7 @@ DIAGONAL_SHIFT = 1e-15  # added to the diagonal of G G^T, which may be singular 
 ITERATION_SHIFT = 1e-8  # added to the diagonal of a singular G G^T, to find redundant constraints by inverse iterations
 MAX_REDUNDANT_EIGENVALUE = 1e-4  # up to this eigenvalue, an eigenvector of G G^T counts as a redundant constraint
 N_REDUNDANT_ITERATIONS = 5  # number of inverse iterations per redundant constraint; few suffice for tiny eigenvalues
-GOLDEN_SECTION = 0.6180339887498949  # multiples of this, modulo 1, are irregular numbers: start of inverse iterations
+GOLDEN_SECTION = 0.6180339887498949  # inverse iterations begin with multiples of this, modulo 1: irregular numbers
 
 
 @merged
@@ -70,9 +70,9 @@ def _multiply_vector(work, target, factor):
 
 @compiled
 def _cholesky(work, pattern, n_rows, n_redundant, row, factors, shift):
-    """Store the Cholesky factor of G G^T + shift I + Z^T Z in each lane, with inverted diagonal entries.
+    """Store the Cholesky factor of G G^T + shift I + Z^T Z in each lane (Z: vanishing combinations of rows of G).
 
-    `factors` contains G (Jacobian, rows of norm 1), Z (vanishing combinations of rows) and the result. `row`: n zeros.
+    `factors` contains G (Jacobian, rows of norm 1), Z and the result, with inverted diagonal entries. `row`: n zeros.
     """
     n_entries = pattern[n_rows] - pattern[0]
     gram = factors + n_entries + n_rows
@@ -215,7 +215,7 @@ ROUNDING_FACTOR = 64.0  # a constraint holds if its residual is at most this num
 MAX_CURVATURE = 0.25
 MIN_EIGENVALUE = 1e-12  # constraints are independent if all eigenvalues of G G^T exceed this (rows of G have norm 1)
 N_WEAKEST_ITERATIONS = 10  # number of inverse iterations for the direction that the constraints determine least
-N_REDUNDANT = 5  # index of the number of redundant rows in `settings`, where other kernels have N_EVALUATIONS
+N_REDUNDANT = 5  # settings[N_REDUNDANT]: number of redundant rows; in kernels for steps, settings[5] is N_EVALUATIONS
 # factors (x, y) of three other guesses, p + x (p - p_0) + y d. p_0 is the first guess; p is p_0 projected onto the
 # constraints; d is the direction that the constraints determine least
 OTHER_GUESSES = ((-2.0, 0.0), (0.0, 1.0), (0.0, -1.0))
@@ -310,7 +310,7 @@ def _gauss_newton(code, settings, control, pattern, moves, work):
                 continue
             for j in range(n):
                 work[(new + j) * LANES + k] += work[(change + j) * LANES + k]
-            # the lane has converged if constraints held before this change, which is applied to improve the accuracy
+            # C is older than this change: if C is a rounding error, the lane has converged, and the change improves q
             if _constraints_hold(work, pattern, n, n_rows, memory, G, new, k):
                 work[at.UNCONVERGED * LANES + k] = 0.0
             else:
@@ -348,7 +348,7 @@ def _project_velocities(code, settings, control, pattern, moves, work):
 
 @compiled
 def _find_weakest_direction(work, pattern, n, n_rows, n_redundant, factors, x, correction, weakest):
-    """Store in `weakest` the direction that constraints determine least, with max|entry| as in `correction`.
+    """Store in `weakest` the direction that constraints determine least, scaled to max|entry| of `correction`.
 
     Set RUNNING to 0 in lanes where more constraints are dependent than the known redundant ones.
     """

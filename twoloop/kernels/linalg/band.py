@@ -166,9 +166,9 @@ def _scratch_view(numbers, n, n_c, b):
 
 @compiled
 def factor_bordered(w, b, Cq, numbers, pivots, factorize, substitute):
-    """Factor [[B, Cq^T], [Cq, 0]] (Cq: constraint Jacobian); return DONE or SINGULAR. `numbers`: banded matrix B.
+    """Factor [[B, Cq^T], [Cq, 0]] with the constraint Jacobian Cq and the banded matrix B, stored in `numbers`.
 
-    `factorize`, `substitute`: indices of the LAPACK routines, DGBTRF and DGBTRS, or the complex ZGBTRF and ZGBTRS.
+    Return DONE or SINGULAR. `factorize`, `substitute`: indices DGBTRF and DGBTRS of LAPACK routines, or ZGBTRF, ZGBTRS.
     """
     n_c, n = Cq.shape
     band = lu_band(numbers, n, b)

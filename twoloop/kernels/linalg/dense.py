@@ -1,6 +1,6 @@
 """Factor small dense matrices in place, without allocation, and record where matrices have nonzero entries.
 
-Innermost loops run along rows, and are skipped if their factor is zero: even small constraint Jacobians are sparse.
+Innermost loops run along rows, and rows with the factor zero are skipped: even small constraint Jacobians are sparse.
 """
 
 from twoloop.kernels.data.common import compiled, merged
@@ -15,7 +15,7 @@ def copy(source, target):
 
 @merged
 def copy_matrix(source, target):
-    """Copy the rows that both matrices have from `source` to `target`."""
+    """Copy rows of `source` to `target`: as many as the matrix with fewer rows has."""
     for i in range(min(source.shape[0], target.shape[0])):
         for j in range(source.shape[1]):
             target[i, j] = source[i, j]
@@ -186,7 +186,7 @@ def ldl_solve(A, x):
 
 @merged
 def ldl_solve_rows(A, B):
-    """Replace each column of B, a right-hand side, by the solution, using the factors A from `ldl_factor`."""
+    """Replace right-hand sides, the columns of B, by the solutions, using the factors A from `ldl_factor`."""
     n, m = B.shape
     for k in range(n):
         for i in range(k + 1, n):

@@ -1,7 +1,7 @@
 """Choose dependent coordinates for generated code: pivots in the constraint Jacobian G, in blocks of one or two rows.
 
-Constant pivots are chosen first: they need no division and do not change. Among varying entries that are large enough,
-the pivot is not the largest but the one that causes the least fill-in: so nearby positions mostly have the same pivots.
+Constant pivots are chosen first: they need no division and do not change. Among varying entries that may be pivots (see
+MAX_SQUARES), choose the one with the least fill-in, not the largest: so nearby positions mostly have the same pivots.
 """
 
 from twoloop.kernels.data.common import INTEGERS, MATRIX, VECTOR, compiled, i8, kernel, merged
@@ -53,9 +53,9 @@ def _find_constant_pivot(R, K, columns, row_active, row_sizes, column_sizes):
 def _is_pivot_block(R, block_columns, squared_norms, i, k, j, l, max_squares, min_sine_square):
     """Return True if rows i, k and columns j, l of R can be a pivot block; for a single pivot, i == k and j == l.
 
-    The sum of squared coefficients must be below `max_squares`, and the squared sine of the angle between the columns
-    above `min_sine_square`, see MAX_SQUARES. `block_columns`: columns in which row i or k has an entry;
-    `squared_norms`: squared norm of each column of G.
+    See MAX_SQUARES: the sum of the squared coefficients of other coordinates must be below `max_squares`; the squared
+    sine of the angle between columns j and l must be above `min_sine_square`. `block_columns`: columns in which row i
+    or k has an entry; `squared_norms`: squared norm of each column of G.
     """
     total = 0.0
     if i == k:
@@ -95,7 +95,7 @@ def _find_varying_pivots(R, K, columns, row_active, row_sizes, column_sizes, squ
     For a single pivot, its row and its column are stored twice. `rows` and `union` are scratch.
     """
     n_rows = 0
-    for i in range(len(R)):  # sort the rows that have no pivot yet by their numbers of entries
+    for i in range(len(R)):  # sort the rows without a pivot: those with the fewest entries first
         if row_active[i]:
             position = n_rows
             while position > 0 and row_sizes[rows[position - 1]] > row_sizes[i]:
@@ -157,7 +157,7 @@ def _subtract_multiple(R, K, columns, row_sizes, column_sizes, union, r, j, i):
 
 @compiled
 def _eliminate(R, K, columns, row_active, row_sizes, column_sizes, union, i, k, j, l):
-    """Solve rows i, k of a pivot block for the coordinates j, l; eliminate these from all rows without a pivot yet."""
+    """Solve rows i, k of a pivot block for the coordinates j, l; eliminate these from all rows that lack a pivot."""
     row_active[i] = row_active[k] = 0
     n, is_single = _merge_columns(columns, row_sizes, i, k, union), i == k
     a, b, c, d = R[i, j], R[i, l], R[k, j], R[k, l]
@@ -189,8 +189,8 @@ def _eliminate(R, K, columns, row_active, row_sizes, column_sizes, union, i, k, 
 def choose_dependent_columns(G, kinds, rows, n_kept, numbers, integers, out):
     """Choose dependent columns of G for the rows rows[:n_kept]; return the number of pivot blocks, or 0 on failure.
 
-    `kinds`: kind of each entry of G, row by row: NONE, NUMBER or VARIES. `out` receives two rows (as indices in `rows`)
-    and two columns of each block; for a single pivot, both twice. `numbers`, `integers`: scratch (`scratch_sizes`).
+    `kinds`: NONE, NUMBER or VARIES for each entry of G, row by row. For each block, `out` receives two rows (indices in
+    `rows`) and two columns; for a single pivot, one row twice and one column twice. Scratch: see `scratch_sizes`.
     """
     n = G.shape[1]
     if n_kept > n:

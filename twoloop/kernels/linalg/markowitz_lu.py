@@ -19,7 +19,7 @@ MAX_SPARSE_ROWS = 3  # matrices of at most this number of rows have sparse facto
 ZERO_PIVOT = 1e-11  # if |pivot| is at most this fraction of the largest |pivot| before it, the matrix is singular
 # if a program for r rows needs more than MIN_SUBTRACTIONS + SUBTRACTIONS_PER_ROW * r subtractions, factors are dense
 MIN_SUBTRACTIONS, SUBTRACTIONS_PER_ROW = 2000, 100
-MAX_ENTRIES_PER_LINE = 64  # largest number of entries in a row or column of sparse factors; with more, they are dense
+MAX_ENTRIES_PER_LINE = 64  # if a row or column of sparse factors would have more entries than this, factors are dense
 
 ORDER_CHOSEN, SINGULAR_MATRIX, TOO_MANY_ENTRIES = range(3)  # codes of `choose_order`; the last: use dense factors
 
@@ -33,13 +33,13 @@ ORDER_CHOSEN, SINGULAR_MATRIX, TOO_MANY_ENTRIES = range(3)  # codes of `choose_o
     WIDTH,  # number of columns of the whole Jacobian
     N_HEAD,
 ) = range(7)
-# After these numbers, `index` contains the arrays below. The array `values` contains the diagonal, then U from its last
-# row up, then L row by row
+# The array `values` contains the diagonal, then the rows of U from the last to the first, then the rows of L from the
+# first to the last. The array `index` contains the numbers above, and then
 # - row indices of the Jacobian, then its column indices, both in the order of elimination
 # - row exchanges by `lu_factor`, if the factors are dense
-# - where each row of U begins in `values`; where each row of U ends; where each row of L begins; where L ends
+# - indices in `values` where each row of U begins, where each row of U ends, where each row of L begins, where L ends
 # - for each entry of `values`: its row and its column, as positions in the order of elimination; its source, which is
-#   the index of its initial value in the argument `entries` of `factor` (for fill-in, the index of a zero there)
+#   the index of its initial value in the argument `entries` of `factor` (for fill-in, `entries` is 0 at this index)
 # - for each subtraction of an elimination: index of the entry in `values` that it changes
 # - scratch in which `choose_order` works, see `views_of_lists`
 
@@ -87,7 +87,7 @@ def columns_of(index):
 
 @inlined
 def row_exchanges_of(index):
-    """Return the view of `index` for the row exchanges of dense factors, which `lu_factor` stores."""
+    """Return the view of `index` in which `lu_factor` stores the row exchanges of dense factors."""
     return index[N_HEAD + 2 * index[SIZE] : N_HEAD + 3 * index[SIZE]]
 
 
@@ -111,7 +111,7 @@ def index_of_lower_begins(r):
 
 @merged
 def index_of_entries(r):
-    """Return where a program for r rows lists the rows, columns and indices of initial values of entries of L and U."""
+    """Return the offset of three lists in a program for r rows: row, column, source (see SOURCES) of factor entries."""
     return N_HEAD + 6 * r + 1
 
 
@@ -119,8 +119,8 @@ def index_of_entries(r):
 def views_of_lists(index, values):
     """Return views of the scratch for choosing an order: counts (N_COUNTS, r), lists (N_LISTS, r, w), numbers (r, w).
 
-    r: number of rows; w: largest number of entries in a row or column; counts: see ROW_SIZE; lists: see COLUMNS.
-    `numbers` contains the values of the entries of each column.
+    r is the number of rows, w the largest number of entries in a row or column. For counts see ROW_SIZE, for lists see
+    COLUMNS. Row j of `numbers` contains the values of the entries in column j.
     """
     r = index[SIZE]
     width = min(r, MAX_ENTRIES_PER_LINE)
@@ -131,7 +131,7 @@ def views_of_lists(index, values):
 
 @compiled
 def clear_lists(index, r):
-    """Prepare `index` for a matrix of r rows that `put_entry` then fills: make its lists of entries empty."""
+    """Empty the lists of entries in `index`, so that `put_entry` can fill them for a matrix of r rows."""
     index[SIZE] = r
     index[DENSE] = 0
     for k in range(index.size - N_COUNTS * r, index.size):
@@ -190,7 +190,7 @@ def _choose_pivot(matrix, rows, columns, k):
 
 @merged
 def _exchange(order, position, k, chosen):
-    """Exchange two entries of `order`, so that `chosen` is entry k; return -1, or 1 if the order stays the same."""
+    """Move `chosen` to entry k of `order` by an exchange; return the sign of this permutation (1: no change)."""
     previous, exchanged = position[chosen], order[k]
     order[k], order[previous] = chosen, exchanged
     position[chosen], position[exchanged] = k, previous
@@ -201,8 +201,8 @@ def _exchange(order, position, k, chosen):
 def _eliminate_entry(matrix, row, column, pivot, j, zero_source):
     """Subtract from column j the multiple of the pivot column that makes entry (row, j) zero.
 
-    `row` and `column`: indices of the pivot's row and column; `pivot`: its value. Fill-in entries get the source
-    `zero_source`, the index of a zero. Return False if there is no space for a fill-in entry.
+    `row` and `column`: indices of the pivot's row and column; `pivot`: its value. `zero_source`: source of
+    fill-in entries, see `put_entry`. Return False if there is no space for a fill-in entry.
     """
     counts, lists, numbers = matrix
     for m in range(counts[COLUMN_SIZE, j]):
@@ -233,7 +233,7 @@ def choose_order(index, matrix, zero_source, zero_ratio):
 
     `matrix`: the views of `views_of_lists`, filled by `put_entry`; the elimination changes them. Codes: ORDER_CHOSEN
     (`index` is complete); TOO_MANY_ENTRIES (use dense factors); SINGULAR_MATRIX (a pivot is at most `zero_ratio` times
-    the largest so far). Fill-in entries get the source `zero_source`, the index of a zero.
+    the largest so far). `zero_source`: source (see `put_entry`) of fill-in entries, whose initial value is 0.
     """
     counts, lists, numbers = matrix
     r = index[SIZE]
@@ -274,7 +274,7 @@ def _sort_row(columns, sources, size, position):
 
 @compiled
 def _sort_and_count(rows, counts, lists):
-    """Sort each row's entries by the order of elimination; return the number of all entries, and that of subtractions.
+    """Sort each row's entries by the order of elimination; return the numbers of all entries and all subtractions.
 
     counts[ACTIVE_ROW_SIZE, k] becomes the number of entries of row k of U, without the diagonal.
     """
@@ -392,9 +392,9 @@ def factor(entries, index, values):
 
 @merged
 def run_program(index, values):
-    """Factor the matrix in `values` in place, by the program in `index`; return min|pivot| / max|pivot|, or -1.
+    """Factor the matrix in `values` in place by the program in `index`; return min|pivot| / max|pivot|; -1 on failure.
 
-    It is -1 if a pivot is zero or NaN, or if the magnitude of an entry of L exceeds MAX_MULTIPLIER.
+    Failure: a pivot is zero or NaN, or the magnitude of an entry of L exceeds MAX_MULTIPLIER.
     """
     r, n_slots = index[SIZE], index[N_SLOTS]
     column_list = index_of_entries(r) + n_slots

@@ -11,7 +11,7 @@ from numba import types
 from twoloop.kernels.data.common import INTEGERS, MATRIX, VECTOR, compiled, f8, i8, kernel, merged
 from twoloop.kernels.linalg.dense import copy_matrix, largest_of, ldl_factor, ldl_solve, ldl_solve_rows
 
-ROUNDING_OF_SQUARES = 4.0 * 2.0**-52  # rounding error of dot products of n rows, relative to n * sum of all |row|^2
+ROUNDING_OF_SQUARES = 4.0 * 2.0**-52  # rounding error of dot products of n rows, relative to n * (sum of their |row|^2)
 REORTHOGONALISE_BELOW = 0.5  # a row is orthogonalised again if |orthogonal part|^2 is below this fraction of |row|^2
 
 
@@ -111,11 +111,11 @@ def norm_of_inverse(factors, n, column):
 
 @kernel(types.boolean(MATRIX, INTEGERS, f8, MATRIX, MATRIX, MATRIX, INTEGERS, MATRIX, VECTOR), vectorized=True)
 def express_other_rows(rows, order, min_sine, chosen_rows, basis, factors, kept, coefficients, norms):
-    """If n chosen rows are independent, express the other rows as linear combinations of them; else return False.
+    """Express rows as linear combinations of chosen rows; return False if the chosen rows are not independent.
 
-    The chosen rows are those with the indices order[:n] in `rows`; they are copied to `chosen_rows`, of n rows. Row i
-    of `coefficients` becomes the coefficients of the combination that is nearest to row order[n + i]. `norms` receives
-    the norms of all rows. For the other arguments see `select_rows`.
+    `chosen_rows`, of n rows, receives the rows with the indices order[:n] in `rows`. Row i of `coefficients` receives
+    the coefficients of the linear combination of these rows that is nearest to row order[n + i]. `norms` receives the
+    norms of all rows. For the other arguments see `select_rows`.
     """
     n = len(chosen_rows)
     for i in range(len(rows)):
@@ -146,14 +146,14 @@ def singular_values_exceed(rows, ratio, gram):
     return math.isfinite(total) and ldl_factor(gram)
 
 
-BOUND_ROUNDING = 1e-12  # a bound of pivots is reduced by this fraction, so that pivots equal to it count as above it
-NOT_DEFINITE, STAYS_SINGULAR = -1, -2  # codes: M with added rows is not positive definite; no rows make M invertible
+BOUND_ROUNDING = 1e-12  # a bound of pivots is reduced by this fraction, so that a pivot equal to the bound is above it
+NOT_DEFINITE, STAYS_SINGULAR = -1, -2  # codes: M + sum s g^T g is not positive definite; no rows g make it invertible
 TINY = 1e-300  # replaces zero as a divisor
-# Limits that decide whether a row of G is independent of previous rows, if the smallest eigenvalue of the mass matrix M
-# exceeds SIMILAR_EIGENVALUES times the largest. S = G M^-1 G^T, scaled to a diagonal of 1, is factored. The row is
-# independent if its pivot in S exceeds INDEPENDENT: then its part orthogonal to previous rows is at least 3e-9 of its
-# norm, the square root of INDEPENDENT * SIMILAR_EIGENVALUES. The row is dependent if this part is at most DEPENDENT
-# times its norm. If neither is true of some row, or if eigenvalues differ more, `select_rows` decides for all rows
+# Limits that decide whether a row of G is independent of previous rows. S = G M^-1 G^T, scaled to a diagonal of 1, is
+# factored. A row is independent if its pivot in S exceeds INDEPENDENT: then its part orthogonal to previous rows is at
+# least 3e-9 of its norm, the square root of INDEPENDENT * SIMILAR_EIGENVALUES. A row is dependent if this part is at
+# most DEPENDENT times its norm. If some row is neither, or if the smallest eigenvalue of the mass matrix M may be below
+# SIMILAR_EIGENVALUES times the largest, `select_rows` decides for all rows
 SIMILAR_EIGENVALUES, INDEPENDENT, DEPENDENT = 1e-7, 1e-10, 1e-10
 # A redundant row is a linear combination of independent rows, all scaled to norm 1. It replaces an independent row if
 # the coefficient of this row exceeds MAX_COEFFICIENT. Then the independent rows are farther from becoming dependent,
@@ -201,7 +201,7 @@ def _eigenvalue_bounds(mass):
 
 @compiled
 def _count_weak_eigenvalues(mass, weak_ratio, A):
-    """Count eigenvalues of M = `mass` up to z = weak_ratio * (their upper bound); store factors of M - z I in A."""
+    """Count eigenvalues of M = `mass` up to z = weak_ratio * (upper bound of all); store factors of M - z I in A."""
     _, largest = _eigenvalue_bounds(mass)
     copy_matrix(mass, A)
     for i in range(len(mass)):
@@ -224,7 +224,7 @@ def _sort_rows_by_entries(G, order, counts):
 
 @merged
 def _removes_weak_eigenvalue(A, g, scale, x):
-    """Return True if adding scale * g^T g to the mass matrix M raises one of its eigenvalues above the limit z.
+    """Return True if adding scale * g^T g to the mass matrix M raises an eigenvalue of M above a limit z.
 
     Then det(M - z I) changes its sign. A: factors of M - z I; g: a row of the Jacobian; x: scratch.
     """
@@ -395,8 +395,8 @@ def _first_bound_below_pivots(S, kept, n_kept, largest_inverse, bounds, scratch)
     """Return the index of the first of `bounds` that is below all pivots of S; if there is none, return bounds.size.
 
     S is G M^-1 G^T, scaled to a diagonal of 1, for the rows `kept` of G. A bound z is below all pivots, whatever the
-    order of elimination, if S - z I is positive definite. This cannot be so if z exceeds the smallest pivot, the
-    reciprocal of `largest_inverse` (0: unknown, then it is computed).
+    order of elimination, if S - z I is positive definite. This cannot be so if z exceeds the smallest pivot,
+    1 / `largest_inverse`. If `largest_inverse` is 0, it is computed first.
     """
     shifted = scratch[: n_kept * n_kept].reshape((n_kept, n_kept))
     if largest_inverse == 0.0:
@@ -438,10 +438,10 @@ def _mark_independent_rows(G, min_sine, basis, factors, coefficients, C, kept, i
 def choose_rows(original_mass, G, min_sine, weak_ratio, bounds, workspace, chosen):
     """Choose the independent rows of G, and rows g for which M + sum s g^T g is invertible (M: `original_mass`).
 
-    Rows of G are selected as in `select_rows` with `min_sine`, then exchanged as in `_exchange_rows`. Rows g are chosen
-    if M has eigenvalues below `weak_ratio` times the largest (0: none are chosen). Return the index of the first of
-    `bounds` that is below all pivots of G M^-1 G^T, scaled to a diagonal of 1, or bounds.size if there is none; or a
-    code: STAYS_SINGULAR, NOT_DEFINITE. Other results (n_rows: number of rows of G):
+    Rows of G are selected by limits (see INDEPENDENT) or by `select_rows`, then exchanged by `_exchange_rows`. Rows g
+    are chosen if weak_ratio > 0 and M has eigenvalues below `weak_ratio` times the largest. Return the index of the
+    first of `bounds` that is below all pivots of G M^-1 G^T, scaled to a diagonal of 1; bounds.size if there is none;
+    on failure, STAYS_SINGULAR or NOT_DEFINITE. Other results (n_rows: number of rows of G):
 
     - chosen[0], chosen[1]: number of independent rows, number of rows g. Two lists of length n_rows follow: the indices
       of independent rows, and of rows g. The remaining n_rows numbers are scratch
@@ -470,7 +470,7 @@ def choose_rows(original_mass, G, min_sine, weak_ratio, bounds, workspace, chose
         # the largest 1 / pivot becomes unknown (0) if there are redundant rows, because rows may have been exchanged
         largest_inverse = largest_inverse if n_kept == n_rows else 0.0
         first_bound = _first_bound_below_pivots(S, kept, n_kept, largest_inverse, bounds, scratch)
-        if first_bound < bounds.size:  # the chosen rows are certainly independent
+        if first_bound < bounds.size:  # all pivots exceed a bound: the chosen rows are certainly independent
             return first_bound
     _mark_independent_rows(G, min_sine, basis, factors, sizes, C, kept, order)
     chosen[0] = n_kept = _exchange_rows(C, order, kept)

@@ -162,7 +162,7 @@ def multipliers_by_elimination(f, w, r, a, lam):
 
 @merged
 def factor_mass(f, w):
-    """Store in w.L the factors of the mass matrix w.M (if M is constant and not banded, M^-1); return a code."""
+    """Store in w.L factors of the mass matrix M, or M^-1 if M is constant and not banded; return a status code."""
     if has_banded_mass(f):
         is_definite = factor_banded_mass(f, w) == DONE
     else:
@@ -201,7 +201,7 @@ def _is_equal(A, B):
 
 @merged
 def factor_schur_complement(f, w):
-    """Store in w.S the factors of G M^-1 G^T, unless M is constant and G the same as before; return a code."""
+    """Store in w.S the factors of G M^-1 G^T, unless it has them already (M constant, G unchanged); return a code."""
     is_constant = f.constant_mass == 1
     if is_constant and _is_equal(w.G, w.G_of_S):
         return DONE
@@ -241,8 +241,8 @@ def solve_by_schur_complement(f, w, r, c, a):
             a[j] -= M_inverse_G[i, j] * w.z[i]
 
 
-# the augmented form is used if there are at least MIN_ROWS constraints (measured: it is fastest from 7), and at least
-# MIN_ROWS degrees of freedom or, unless M is diagonal, MIN_COORDINATES coordinates (measured: fastest from about 30)
+# the augmented form needs at least MIN_ROWS constraints (measured: it is fastest from 7 on), and as many degrees of
+# freedom. If M is not diagonal, MIN_COORDINATES coordinates suffice in place of these (measured: fastest from about 30)
 MIN_ROWS = 8
 MIN_COORDINATES = 32
 
@@ -286,7 +286,7 @@ def _write_augmented_program(w):
 
 @compiled
 def _run_augmented_program(w):
-    """Factor the augmented matrix by its program; return False if a pivot is zero or NaN, or an entry of L is large."""
+    """Factor the augmented matrix; return False if a pivot is 0 or NaN, or |entry of L| exceeds MAX_MULTIPLIER."""
     index, values, scale, first_of_mass = w.index_a, w.values_a, w.mass_scale, w.entries.size
     source = index_of_entries(index[at.SIZE]) + 2 * index[at.N_SLOTS]
     for s in range(index[at.N_SLOTS]):
@@ -297,7 +297,7 @@ def _run_augmented_program(w):
 
 @compiled
 def factor_augmented(f, w):
-    """Factor the augmented matrix [M G^T; G 0]; if factors are not sparse, f.form becomes dense; return a code."""
+    """Factor the augmented matrix [M G^T; G 0], or set f.form = f.dense_form if factors are dense; return a code."""
     w.n_factorizations += 1
     has_new_entry = f.constant_mass == 0 and update_pattern(w.M, w.mass_pattern)
     if w.index_a[at.SIZE] == 0 or has_new_entry or not _run_augmented_program(w):
@@ -338,7 +338,7 @@ def solve_augmented(w, r, c, a):
 
 @compiled
 def _factor_augmented_or_dense(f, w):
-    """Factor the augmented matrix; if its factors are not sparse, prepare the dense form instead; return a code."""
+    """Factor the augmented matrix; if the factors are not sparse, prepare the form f.dense_form; return a code."""
     code = factor_augmented(f, w)
     if code == DONE and f.form == NULL_SPACE:
         find_null_space(w)

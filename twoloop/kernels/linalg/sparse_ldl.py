@@ -31,7 +31,7 @@ NOT_DEFINITE = -1.0  # result of `factor` if a pivot of M is not positive; a res
 
 @compiled
 def _fill_stiffness(program, mass, jacobian, stiffness, scratch):
-    """Store in `stiffness` the number s of each row g of G that is added to a singular M as s g^T g.
+    """For each row g of G that is added to a singular M as s g^T g, store the number s in `stiffness`.
 
     s is m / |g|^2, so that s g^T g is about as large as M; m: largest M_jj of the columns j in which g has entries.
     """
@@ -78,12 +78,12 @@ def fill_saddle_matrix(program, mass, jacobian, values, stiffness, scratch):
 
 @compiled
 def factor(program, is_independent, values, sizes, min_sine_square):
-    """Replace the matrix in `values` by its factors, with 1/pivot on the diagonal; return the smallest squared sine.
+    """Replace the matrix in `values` by its factors; return the smallest squared sine of angles between rows of G.
 
-    The sine is that of the angle between a row of G and the span of previous rows. Its square is -pivot / (squared norm
-    of the row); the squared norms are stored in `sizes`. On entry, `is_independent` is 0 for rows that count as
-    redundant. It becomes 0 for rows whose squared sine is at most `min_sine_square`. Factors leave out rows with 0. If
-    the pivot of a coordinate is not positive (M is not positive definite), return NOT_DEFINITE.
+    The angle is between a row and the span of previous rows. Its squared sine is -pivot / (squared norm of the row);
+    `sizes` receives the squared norms, and the diagonal 1/pivot. On entry, `is_independent` is 0 for rows that count as
+    redundant. It is set to 0 for rows with a squared sine of at most `min_sine_square`. The factors leave out rows with
+    `is_independent` = 0. If a pivot of a coordinate is not positive (M is not positive definite), return NOT_DEFINITE.
     """
     (n_q, n) = program[N_COORDINATES], program[N_PIVOTS]
     order, runs = pivot_order_of(program), update_runs_of(program)

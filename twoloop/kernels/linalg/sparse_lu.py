@@ -82,7 +82,7 @@ def column_groups(entries: Entries, n_q: int) -> Integers:
 
 @inlined
 def tangent_entries_of(program):
-    """Return the rows and columns of entries of the force derivatives K and D; where column groups begin, and end."""
+    """Return three arrays: row and column of each entry of K and D (force derivatives), and bounds of column groups."""
     group_begins = program[end_of_sections(program) :]
     rows, columns, _ = mass_entries_of(program)
     n_mass = rows.size - group_begins[group_begins.size - 1]
@@ -93,7 +93,7 @@ def tangent_entries_of(program):
 def fill_newton_matrix(program, mass, jacobian, K, D, z, stiffness, values):
     """Store in `values` Newton's matrix [M - z^2 K - z D, G^T; G, 0]; z (real or complex): multiple of the step size.
 
-    K, D: derivatives of forces. `stiffness`: the number s of each row g of G that is added to a singular M as s g^T g.
+    K, D: derivatives of forces. `stiffness`: for each row g of G, factor s of a term s g^T g added to a singular M.
     """
     for s in range(values.size):
         values[s] = 0.0
@@ -117,7 +117,7 @@ def fill_newton_matrix(program, mass, jacobian, K, D, z, stiffness, values):
 
 @compiled
 def factor(program, is_independent, values, sizes):
-    """Replace the matrix in `values` by its factors L U, 1/pivot on the diagonal; return False if a pivot is too small.
+    """Replace the matrix in `values` by its factors L U (diagonal: 1/pivot); return False if a pivot is too small.
 
     Redundant rows (0 in `is_independent`) have factors of 0, so that they do not affect solutions. `sizes` is scratch.
     """

@@ -57,11 +57,11 @@ class _PartSupports:
 
     def __init__(self, joints: Sequence[frozenset[int]], n_bodies: int, hubs: set[int], lone_bodies: AbstractSet[int]):
         self.joints, self.hubs = joints, set(hubs)  # bodies of each joint; hubs that are not eliminated yet
-        # hubs with a single coordinate. A joint with such a hub may fix a part; so it counts as a joint with the ground
+        # hubs with a single coordinate: joints with such hubs may immobilize a part, so count as joints with the ground
         self.lone_bodies = lone_bodies
         self.parts = _DisjointSets(n_bodies)
         self.is_grounded = [False] * n_bodies
-        self.hubs_by_part: list[set[int]] = [set() for _ in range(n_bodies)]  # hubs that support a part, by first body
+        self.hubs_by_part: list[set[int]] = [set() for _ in range(n_bodies)]  # index: smallest body of the part
         self.supported_bodies: dict[int, list[int]] = {hub: [] for hub in hubs}  # a body of each part supported so far
 
     def can_eliminate(self, joint: int) -> bool:
@@ -84,7 +84,7 @@ class _PartSupports:
         self._merge_parts((body for body in bodies if body not in self.hubs), is_grounded, bodies & self.hubs)
 
     def eliminate_hub(self, hub: int) -> None:
-        """Merge an eliminated hub (a body with many joints) and the parts that it supports; update their supports."""
+        """Merge an eliminated hub (body with many joints) and the parts that it supports, and update their supports."""
         self.hubs.discard(hub)
         supported_bodies = self.supported_bodies.pop(hub)
         for body in supported_bodies:
@@ -193,7 +193,7 @@ def _minimum_degree_order(
 ) -> list[int]:
     """Return the order of elimination of joints and hubs as indices: k for joint k, len(joints) + k for hub k.
 
-    Hubs are bodies with many joints. The next joint or hub is the one, of those allowed, whose neighbours have the
+    Hubs are bodies with many joints. Of the allowed joints and hubs, the next one is that whose neighbours have the
     fewest rows and coordinates (`sizes`). `pairs`: hubs coupled without a joint. `lone_bodies`: see `_PartSupports`.
     """
     n_joints = len(joints)
@@ -225,7 +225,7 @@ def _minimum_degree_order(
         if is_eliminated[node] or degree_on_heap != degree(node):
             continue  # this entry of the heap is outdated, and a newer one is also in the heap
         if node < n_joints and not supports.can_eliminate(node):
-            continue  # the joint must wait for the elimination of a hub beside it, which puts it on the heap again
+            continue  # wait: the elimination of an adjacent hub will put this joint on the heap again
         is_eliminated[node] = True
         order.append(node)
         affected_nodes = neighbours[node]
@@ -256,8 +256,8 @@ Entries = tuple[Integers, Integers]  # row indices and column indices of the non
     N_HEAD,
 ) = range(9)
 ALWAYS_ALLOWED_UPDATES = 3_000_000  # a program is always written if it has at most this number of updates
-MAX_UPDATE_RATIO = 1e-3  # a longer program for n pivots is written only if it has at most this times n^3 updates
-MAX_UPDATES = 30_000_000  # largest number of updates of a program; writing a longer program takes too much memory
+MAX_UPDATE_RATIO = 1e-3  # largest (number of updates) / n^3 for n pivots, unless ALWAYS_ALLOWED_UPDATES allows more
+MAX_UPDATES = 30_000_000  # largest number of updates of a program; a longer one would take too much memory to write
 
 
 def factorization_program(
@@ -268,7 +268,7 @@ def factorization_program(
     body_groups: Iterable[Sequence[int]] = (),
     stiff_rows: Sequence[int] = (),
 ) -> NDArray[np.int32] | None:
-    """Return the program that factors [M G^T; G 0]; None if the program would have too many updates.
+    """Return the program that factors [M G^T; G 0]; None if it would have too many updates (see MAX_UPDATES).
 
     mass, jacobian : entries of M, both triangles, and of G. If an entry is listed repeatedly, its values are added.
     body_groups : groups of coordinates that form one body each, even if M does not couple them.
@@ -281,7 +281,7 @@ def factorization_program(
 def program_in_order(
     order: Integers, n_q: int, mass: Entries, jacobian: Entries, stiff_rows: Sequence[int], unsymmetric: bool = False
 ) -> NDArray[np.int32] | None:
-    """Return the program for an order of elimination; None if the program would have too many updates.
+    """Return the program for an order of elimination; None if its updates would be too many (see MAX_UPDATES).
 
     If `unsymmetric`, factors are L U: entry (i, j) of U is program[N_OFF_DIAGONAL] numbers behind entry (j, i) of L.
     """
@@ -341,7 +341,7 @@ def _update_runs(targets: Integers, diagonal: NDArray[np.bool_]) -> Integers:
 
 
 def _products_of_entries(rows: Integers, chosen: Sequence[int]) -> tuple[Integers, Integers, Integers]:
-    """List the pairs of entries whose products form g^T g, for rows g in `chosen`: row and indices of both entries."""
+    """Return the row, first entry and second entry (indices) of each product in g^T g, for the rows g in `chosen`."""
     parts: list[tuple[Integers, Integers, Integers]] = [(rows[:0], rows[:0], rows[:0])]
     sequence = np.argsort(rows, kind="stable")
     sorted_rows = rows[sequence]
@@ -366,8 +366,8 @@ def _index_pairs(m: int) -> Entries:
 def _columns_of_factors(n: int, low: Integers, high: Integers) -> list[Integers]:
     """Return, for each column of L, the rows that have an entry below the diagonal, including fill-in.
 
-    `low`, `high`: columns and rows of the matrix entries. If i is the first of the rows in a column of L, the
-    elimination of this column causes entries in column i, in the other rows.
+    `low`, `high`: column and row of each entry of the matrix. Let i be the first row in a column of L: the elimination
+    of this column creates entries in column i, in all other rows of the eliminated column.
     """
     rows_below: list[set[int]] = [set() for _ in range(n)]
     for column, row in zip(low.tolist(), high.tolist(), strict=True):
@@ -398,7 +398,7 @@ def pivot_order_of(program):
 
 @inlined
 def factor_columns_of(program):
-    """Return two lists: where each column of L begins, with the end of the last one; and the row of each entry."""
+    """Return the indices at which columns of L begin, then the end of the last column; also the rows of all entries."""
     begin = N_HEAD + program[N_PIVOTS]
     middle = begin + program[N_PIVOTS] + 1
     return program[begin:middle], program[middle : middle + program[N_OFF_DIAGONAL]]
@@ -406,7 +406,7 @@ def factor_columns_of(program):
 
 @inlined
 def update_runs_of(program):
-    """Return the ranges of adjacent entries that updates change: for each, its length and index of its first entry."""
+    """Return, for each range of adjacent entries that updates change, its length and the index of its first entry."""
     begin = N_HEAD + 2 * program[N_PIVOTS] + 1 + program[N_OFF_DIAGONAL]
     return program[begin : begin + program[N_RUNS]]
 
@@ -429,9 +429,9 @@ def jacobian_entries_of(program):
 
 @inlined
 def stiffening_products_of(program):
-    """Return four lists of the products g_i g_j in s g^T g, which is added to a singular M for some rows g of G.
+    """Return four lists with one number for each product g_i g_j in terms s g^T g (g: row of G) added to a singular M.
 
-    For each product: its row; the indices of both entries; the index, in the factors, of the entry of M to add it to.
+    The numbers: index of the row g, indices of g_i and of g_j, and index, in the factors, of the changed entry of M.
     """
     n = program[N_STIFFENED]
     begin = N_HEAD + 2 * program[N_PIVOTS] + 1 + program[N_OFF_DIAGONAL] + program[N_RUNS]

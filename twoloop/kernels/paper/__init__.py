@@ -1,1 +1,1 @@
-"""Procedures of the paper of 2016: implicit Runge-Kutta, Newmark and BDF steps with an outer and an inner loop."""
+"""Implicit Runge-Kutta, Newmark and BDF steps of the paper (Zhang & Zhang, 2016), with an outer and an inner loop."""

@@ -22,10 +22,10 @@ MAX_ORDER = 5
 N_DIFFERENCES = MAX_ORDER + 2  # differences of orders 0 to MAX_ORDER + 1
 STARTER_STAGES = 3  # number of stages of the Gauss steps at the beginning of a run with fixed step size
 MAX_ITERATIONS = 60  # number of fixed-point iterations after which a step has failed
-SAFETY = 0.9  # safety factor on the size of a repeated step; also smallest ratio of step sizes after an accepted step
-MIN_STEP_FACTOR = 0.2  # smallest ratio of step sizes after a rejected step, or if predicted positions are inaccurate
+SAFETY = 0.9  # safety factor on sizes of repeated steps; after an accepted step, (next size) / (size) is at least this
+MIN_STEP_FACTOR = 0.2  # smallest (next size) / (size) after rejected steps, or if predicted positions are inaccurate
 ERROR_FACTOR = 10.0  # factor on the error estimate, because the errors of many short steps add up
-STEP_SIZE_FACTOR = 6.0  # further factor on the estimate in the choice of the next step size, to avoid rejections (VODE)
+STEP_SIZE_FACTOR = 6.0  # further factor on error estimates that set the next step size, to avoid rejections, as in VODE
 ORDER_FACTOR = 1.4  # factor on the error estimates of the next lower and higher order, so that the order changes rarely
 MIN_INCREASE = 1.2  # the step size is kept if it could grow by less than this factor
 MAX_INCREASE = 2.0  # largest ratio of successive step sizes
@@ -34,7 +34,7 @@ MAX_INCREASE = 2.0  # largest ratio of successive step sizes
 HIGHEST, INNER_TOL, OUTER_TOL, N_OPTION_SCALARS = range(4)
 # indices of the scalars in `memory`; the arrays of _coefficient_row and _history_views follow
 (
-    HAS_TRIAL,  # 1: the last attempt has computed a step, with its differences; 0: it has failed
+    HAS_TRIAL,  # 1: a step was computed that is not yet accepted or rejected; 0: no step, or the attempt has failed
     ORDER,  # order of the next attempt
     DEPTH,  # order of the highest difference in the history
     AGE,  # number of accepted steps since the last change of order or the last rejected step
@@ -67,7 +67,7 @@ def _coefficient_row(memory, row):
 
 @inlined
 def _history_views(memory, n):
-    """Return views of `memory`: differences of the history, and of the attempted step; prediction; rate; scratch.
+    """Return views of `memory`: differences of the history and of the attempt, a prediction and its rate, and scratch.
 
     The first two are tables (N_DIFFERENCES, 2 n): row k contains the differences of order k of (q, v). `prediction` is
     the predicted (q, v) at the end of the step, and `rate` its time derivative (2 n each).
@@ -103,7 +103,7 @@ def commit_bdf(f, w, options, memory, tolerances, accepted):
 
 @compiled
 def _begin_history(memory, differences, state, h, order):
-    """Start a history from `state` = [q, v, a, ...] for steps of size h (s); `order`: of the first step, 0 or 1."""
+    """Start a history from `state` = [q, v, a, ...] for steps of size h (s), the first of which has `order` 0 or 1."""
     size = differences.shape[1]
     for m in range(size):
         differences[0, m] = state[m]
@@ -205,7 +205,7 @@ def _difference_norm(tolerances, y, y1, d, sign, difference):
 
 @compiled
 def _choose_order(options, memory, tolerances, trial, y, y1, d):
-    """Choose the next order (NEXT_ORDER); return the error estimate, in tolerances, and (next step size) / (this one).
+    """Store the next order in NEXT_ORDER; return the step's error, in tolerances, and (next step size) / (step size).
 
     y, y1: (q, v) at both ends of the step. d: y1 minus its prediction. `trial`: its row k contains the differences of
     order k of (q, v) at past steps, scaled to this step size by `_predict_state`.
@@ -248,7 +248,7 @@ def _choose_order(options, memory, tolerances, trial, y, y1, d):
 
 @compiled
 def _update_differences(memory, trial, y1, d):
-    """Replace the differences in `trial`, at the beginning of the step, by those at its end y1 = prediction + d."""
+    """Update the differences in `trial` from the beginning to the end y1 of a step; d: y1 minus its prediction."""
     k = int(memory[ORDER])
     memory[NEXT_DEPTH] = k + 1
     if memory[DEPTH] > k and k < MAX_ORDER:
@@ -285,7 +285,7 @@ def _gauss_step(f, w, options, tolerances, t, h, state, new_state, scratch):
 def bdf_step(f, w, options, memory, t, h, tolerances, state, new_state):
     """Attempt a step: predict from the history, correct, and choose the order and the size of the next step.
 
-    If the step size is fixed, the order is options[HIGHEST], after as many Gauss steps, which fill the history.
+    If the step size is fixed, the first options[HIGHEST] steps are Gauss steps; then the order is options[HIGHEST].
     """
     n = w.Q.size
     differences, trial, prediction, rate, scratch = _history_views(memory, n)

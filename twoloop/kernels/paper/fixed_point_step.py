@@ -49,10 +49,10 @@ def commit_runge_kutta(f, w, options, memory, tolerances, accepted):
 def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
     """Attempt a step by fixed-point iteration; estimate its error from a step of size h and two steps of size h/2.
 
-    The new state is the end of the second half step. If options[EXTRAPOLATION] is not 0, it is extrapolated from the
-    ends of the whole step and of the half steps, and projected onto the constraints. The first guess of stages is the
-    polynomial through the stage accelerations: of the last accepted step for the whole step, of the whole step for half
-    steps. If the step size is fixed, only the whole step is computed.
+    The new state is the end of the second half step. If options[EXTRAPOLATION] is not 0, the state is extrapolated
+    from the ends of the whole step and of the half steps, and projected onto the constraints. The polynomial through
+    the stages of the last accepted step predicts the stages of the whole step; the polynomial through these predicts
+    the stages of half steps. If the step size is fixed, only the whole step is computed.
     """
     s, _, _, _, _, c = tableau_of(options)
     n = w.Q.size
@@ -92,7 +92,7 @@ def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
         )
         if code != DONE:
             return Attempt(code, np.inf, 0.0)
-        # the prediction error of the whole step does not count, because its end is discarded
+        # the prediction error of the whole step does not count, because the end of the whole step is discarded
         prediction_error = max(prediction_error, prediction_error_mid)
         code, error = estimate_and_extrapolate(
             f, w, options[EXTRAPOLATION], options[INNER_TOL], t + h, tolerances, q, v, q_full, v_full, q1, v1
@@ -115,7 +115,7 @@ SUDDEN_ERROR = 10.0  # a step is rejected if jumps of forces cause a larger erro
 
 @kernel(ATTEMPT)
 def paper_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """Attempt a step of size h as in Sects. 3.1-3.3 of the paper; estimate its error by comparison with two of h/2."""
+    """Attempt a step as in Sects. 3.1-3.3 of the paper; estimate its error by comparison with two half steps."""
     s, _, _, _, _, _ = tableau_of(options)
     n = w.Q.size
     q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]

@@ -19,14 +19,14 @@ from twoloop.kernels.steps.stages import INNER_TOL, OUTER_TEST, OUTER_TOL, table
 # in steps of fixed size are compensated for these errors, because otherwise the energy of symmetric methods drifts
 N_ROUNDING = 4
 
-# indices of scalars in `memory`. HAS_TRIAL: 1 if a step was attempted, else 0. H_TRIAL: the size of this step (s).
-# HAS_PREVIOUS, H_PREVIOUS: the same of the last accepted step
+# indices of scalars in `memory`. HAS_TRIAL: 1 if a step was attempted, else 0. H_TRIAL: size (s) of the attempted step.
+# HAS_PREVIOUS: 1 if a step was accepted, else 0. H_PREVIOUS: size (s) of the last accepted step
 HAS_TRIAL, H_TRIAL, HAS_PREVIOUS, H_PREVIOUS, N_MEMORY_SCALARS = range(5)
-# indices of blocks (s, n_q) in `memory`, a row for each stage. A_PREVIOUS: accelerations of the last accepted step.
-# A_TRIAL: of the attempted step. A_HALF: of a half step. Q_STAGE, V_STAGE: positions and velocities
+# indices of blocks (s, n_q) in `memory`, a row for each stage: accelerations in the last accepted step (A_PREVIOUS), in
+# the attempted step (A_TRIAL) and in a half step (A_HALF); positions (Q_STAGE) and velocities (V_STAGE)
 A_PREVIOUS, A_TRIAL, A_HALF, Q_STAGE, V_STAGE, N_BLOCKS = range(6)
-# indices of vectors (n_q) in `memory`: positions Q, velocities V, accelerations A. _FULL: at the end of the whole step.
-# _MID: after the first half step. _OLD: before an iteration. ROUNDING: first of N_ROUNDING vectors of rounding errors
+# indices of vectors (n_q) in `memory`: positions Q_, velocities V_ and accelerations A_ at the end of the whole step
+# (_FULL), after the first half step (_MID), before an iteration (_OLD); rounding errors (ROUNDING: first of N_ROUNDING)
 Q_FULL, V_FULL, Q_MID, V_MID, A_MID, Q_OLD, V_OLD, ROUNDING, N_VECTORS = (*range(8), 7 + N_ROUNDING)
 
 
@@ -73,7 +73,7 @@ def rounding_errors_of(memory, s, n, tolerances):
 
 MAX_ITERATIONS = 60  # number of iterations after which `iterate_accelerations` has failed
 MAX_ITERATIONS_PAPER = 200  # number of iterations after which `iterate_first_order` has failed; the paper has no limit
-MAX_GROWTH = 1e3  # divergence: a change of the stages exceeds this multiple of the first change (it may grow at first)
+MAX_GROWTH = 1e3  # an iteration has diverged if the stages change by more than this times their first change
 MIN_ITERATIONS = 8  # after this number of iterations, a change that is not below the previous one means divergence
 UNDECIDED, CONVERGED, DIVERGED = range(3)  # codes of `_test_convergence`
 
@@ -82,8 +82,8 @@ UNDECIDED, CONVERGED, DIVERGED = range(3)  # codes of `_test_convergence`
 def _test_convergence(change, last_change, first_change, rounded, iteration, tolerance, q):
     """Decide whether an iteration has converged: return UNDECIDED, CONVERGED or DIVERGED.
 
-    It has if the change of the stages is at most `tolerance`, or if rounding errors of q keep it from decreasing.
-    `rounded`: change relative to max(1, |value|), with which rounding errors are compared.
+    It has converged if the stages change by at most `tolerance`, or if rounding errors of q keep their change from
+    decreasing. `rounded`: change of the stages relative to max(1, |value|), to be compared with rounding errors.
     """
     if change <= tolerance:
         return CONVERGED
@@ -107,7 +107,7 @@ def _compensated_sum(x, rounding, increment):
 
 @merged
 def _clear_rounding_errors(coordinates, rounding):
-    """Set this attempt's rounding errors of dependent `coordinates` to zero: the inner loop computes these anew."""
+    """Set this attempt's rounding errors of dependent `coordinates` to 0: the inner loop changes these coordinates."""
     for i in range(N_ROUNDING // 2, rounding.shape[0]):
         for m in coordinates:
             rounding[i, m] = 0.0
@@ -118,9 +118,9 @@ def iterate_accelerations(f, w, options, tolerances, t, h, q, v, A_stage, Q_stag
     """Compute a step of size h from (q, v) by iterating on stage accelerations; return a code and `prediction_error`.
 
     A_stage (s, n) contains predicted accelerations on entry, and the solution on return; (q1, v1) becomes the end of
-    the step, on the constraints. The stages Q_j = q + c_j h v + h^2 sum_k (A A)_jk a_k and V_j = v + h sum_k A_jk a_k,
-    with the tableau A, c, then satisfy eq. (17) of the paper. For undamped systems, an iteration gains as much accuracy
-    as two by `iterate_first_order`. If `rounding` has rows, sums are compensated for rounding errors.
+    the step, on the constraints. The stages Q_j = q + c_j h v + h^2 sum_k (A A)_jk a_k and V_j = v + h sum_k A_jk a_k
+    (A, c: Butcher tableau) then satisfy eq. (17) of the paper. For undamped systems, an iteration gains as much
+    accuracy as two by `iterate_first_order`. If `rounding` has rows, sums are compensated for rounding errors.
     """
     s, A, A2, b, bA, c = tableau_of(options)
     n = q.size
@@ -184,7 +184,7 @@ def iterate_accelerations(f, w, options, tolerances, t, h, q, v, A_stage, Q_stag
 
 @merged
 def _largest_change(coordinates, q, v, q_old, v_old):
-    """Return how much an iteration changes `coordinates` and velocities: max |change| / max(1, |value|)."""
+    """Return the largest |change| / max(1, |value|) of `coordinates` and their velocities in an iteration."""
     change = 0.0
     for m in coordinates:
         change = max(change, abs(q[m] - q_old[m]) / max(abs(q[m]), 1.0))
@@ -277,10 +277,10 @@ def _richardson_error(tolerances, largest, q, v, q_full, v_full, q1, v1):
 
 @compiled
 def estimate_and_extrapolate(f, w, factor, inner_tol, t, tolerances, q, v, q_full, v_full, q1, v1):
-    """Return a code and Richardson's error estimate, in units of the tolerances; if it is at most 1, extrapolate.
+    """Return a code and Richardson's error estimate in tolerances; extrapolate if the estimate is at most 1.
 
-    (q1, v1) is the end of two half steps, (q_full, v_full) the end of a whole step. Extrapolation adds to (q1, v1) the
-    `factor` 1 / (2^order - 1) times their difference, then projects; a factor of 0 means: no extrapolation.
+    (q1, v1) is the end of two half steps, (q_full, v_full) the end of a whole step. Extrapolation adds to (q1, v1)
+    `factor` = 1 / (2^order - 1) times (q1 - q_full, v1 - v_full), then projects. If `factor` is 0, do not extrapolate.
     """
     error = _richardson_error(tolerances, factor > 0.0, q, v, q_full, v_full, q1, v1)
     if not (factor > 0.0 and error <= 1.0):

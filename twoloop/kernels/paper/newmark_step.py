@@ -96,7 +96,7 @@ def newmark_step(f, w, options, memory, t, h, tolerances, state, new_state):
             if tolerances[ESTIMATE] == 1.0:
                 rate = _motion_rate(memory, tolerances[GAP], q, v, a, q1, v1, a1)
                 error = _estimated_error(options, tolerances, rate, h, q, v, a, a1)
-                if options[ERROR_TOL] == 0.0:  # else the estimate is that of the paper, without `prediction_error`
+                if options[ERROR_TOL] == 0.0:  # if it is > 0, the paper's estimate is used, without `prediction_error`
                     for k in range(w.dependent.size):
                         m = w.dependent[k]
                         w.predicted[k] = q[m] + h * v[m] + h * h * ((0.5 - beta) * a[m] + beta * a1[m])

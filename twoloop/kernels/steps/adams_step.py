@@ -20,7 +20,7 @@ from twoloop.kernels.data.common import ATTEMPT, COMMIT, Attempt, Step, inlined,
 from twoloop.kernels.data.indices import ATOL, DONE, RTOL
 from twoloop.kernels.evaluation.inner_loop import evaluate_without_projection, project
 
-HIGHEST = 12  # largest order, as in Shampine and Gordon's STEP; the quadrature with NODES is exact up to order 13
+HIGHEST = 12  # largest order, as in Shampine and Gordon's STEP; the quadrature with NODES would be exact even for 13
 N_TERMS = HIGHEST + 2  # number of stored differences of accelerations, and of their coefficients for v and for q
 ERROR_FACTOR = 5.0  # factor on the error estimate, because the errors of many short steps add up
 SAFETY = 0.8  # safety factor: ratio of the next step size to the size for which the estimate would equal the tolerance
@@ -31,7 +31,7 @@ RESTART_AFTER = 3  # number of successive rejected steps after which the method 
 
 # eight Gauss nodes on [0, 1] and their weights: this quadrature is exact for polynomials up to degree 15
 NODES, WEIGHTS = (0.5 * (1.0 + x) if k == 0 else 0.5 * x for k, x in enumerate(np.polynomial.legendre.leggauss(8)))
-POSITION_WEIGHTS = WEIGHTS * (1.0 - NODES)  # weights of the values of c(s) at NODES in the integral of (1 - s) c(s)
+POSITION_WEIGHTS = WEIGHTS * (1.0 - NODES)  # weights with which c(s) at NODES yields the integral of (1 - s) c(s)
 
 
 def _error_constants():
@@ -45,14 +45,15 @@ def _error_constants():
     return np.abs(coefficients)
 
 
-# for equal steps; lower bounds in unequal ones: after a decrease of h, actual constants hide errors where forces jump
+# error constants of equal steps. They replace error constants of unequal steps that are smaller: after a decrease of h,
+# those are so small that they would hide errors where forces jump
 ERROR_CONSTANTS = _error_constants()
 
-THETA, N_OPTIONS = range(2)  # index in `options`: tolerance at which projections end, see `project`
+THETA, N_OPTIONS = range(2)  # THETA: index in `options` of the tolerance of projections, see `project`
 # indices of the scalars in `memory`. After the scalars, `memory` contains N_ROWS rows of coefficients, two tables of
 # differences, and two scratch rows, see _row, _difference_table and _scratch_rows
 (
-    CURRENT,  # number, 0 or 1, of the table of differences at the last accepted step; the other: of the attempted step
+    CURRENT,  # index (0 or 1) of the table of differences of the last accepted step; an attempt fills the other table
     ORDER,  # order of the next attempt
     DEPTH,  # number of accelerations in the history, at most N_TERMS
     AGE,  # number of accepted steps since the last change of the order or the last rejected step
@@ -62,8 +63,7 @@ THETA, N_OPTIONS = range(2)  # index in `options`: tolerance at which projection
     N_SCALARS,
 ) = range(8)
 # indices of rows in `memory`. PSI, NEW_PSI: times (s) from earlier states to the last one, and to the end of the step.
-# BETA: factors that scale differences to the step. G_VELOCITY, G_POSITION: coefficients of the scaled differences in
-# velocities and positions. C_AT_NODES: scratch
+# BETA: factors that adapt differences to the step size. G_VELOCITY, G_POSITION: coefficients of the products in v, q
 PSI, NEW_PSI, BETA, G_VELOCITY, G_POSITION, C_AT_NODES, N_ROWS = range(7)
 
 
@@ -87,7 +87,7 @@ def _row(memory, index):
 def _difference_table(memory, n, index):
     """Return a view of table `index` (0 or 1) of differences: N_TERMS + 1 rows of n entries, padded.
 
-    Row i - 1 is the predicted difference phi_i of the accelerations. The last row, added to it, corrects it.
+    Row i - 1 has the predicted difference phi_i of accelerations. The sum of this and the last row is the final phi_i.
     """
     width = (n + 3) // 4 * 4
     start = N_SCALARS + N_ROWS * (N_TERMS + 2) + int(index) * (N_TERMS + 1) * width
@@ -96,7 +96,7 @@ def _difference_table(memory, n, index):
 
 @inlined
 def _scratch_rows(memory, n):
-    """Return scratch rows x, y (n, padded): v + h x, q + h (v + h y) predict a step h; later 1 / (allowed errors)."""
+    """Return two scratch rows (n, padded), for means of accelerations in a step, later for 1 / (allowed errors)."""
     width = (n + 3) // 4 * 4
     start = N_SCALARS + N_ROWS * (N_TERMS + 2) + 2 * (N_TERMS + 1) * width
     return memory[start : start + width], memory[start + width : start + 2 * width]
@@ -152,7 +152,7 @@ def _compute_coefficients(memory, h, k):
         beta[i + 1] *= beta[i]
     for m in range(8):
         c[m] = 1.0
-    previous_psi = 0.0  # psi_i(n); at first i = 0, and psi_0 = 0
+    previous_psi = 0.0  # time (s) from the state i steps before the last accepted state to that state; 0 for i = 0
     for i in range(k + 2):
         velocity_integral = 0.0
         position_integral = 0.0
@@ -168,12 +168,12 @@ def _compute_coefficients(memory, h, k):
 
 @merged
 def _predict_state(memory, h, k, old, new, state, q1, v1, n):
-    """Predict (q1, v1) after a step of size h at order k from differences `old`; store those at its end in `new`."""
+    """From differences `old`, predict (q1, v1) and the differences `new` at the end of a step of size h and order k."""
     beta, g, G = _row(memory, BETA), _row(memory, G_VELOCITY), _row(memory, G_POSITION)
     mean_v, mean_q = _scratch_rows(memory, n)
     for m in range(0, old.shape[1], 4):
         d0, d1, d2, d3 = old[N_TERMS, m], old[N_TERMS, m + 1], old[N_TERMS, m + 2], old[N_TERMS, m + 3]
-        # old[k] + d0 is a difference, see `_difference_table`; row k + 1 of `new` is for the estimate at order k + 1
+        # old[k] + d0 is the difference phi_{k+1}; row k + 1 of `new` serves to estimate errors of order k + 1
         b = beta[k]
         new[k + 1, m] = -b * (old[k, m] + d0)
         new[k + 1, m + 1] = -b * (old[k, m + 1] + d1)
@@ -235,9 +235,9 @@ def _estimate_error(g, G, h, order, largest_v, largest_q):
 def _choose_order(memory, h, k, table, d, n):
     """Choose the next order (NEXT_ORDER); return the estimated error, in tolerances, and (next step size) / h.
 
-    The rules are taken from STEP (Shampine and Gordon). The order k decreases if the estimates at lower orders are not
-    larger. It increases if k + 1 steps had the order k and the estimate at order k + 1 is smaller. While STARTING is 1,
-    it increases in every step. `table`: predicted differences; `d`: evaluated minus predicted accelerations.
+    The rules are those of STEP (Shampine and Gordon). The order k decreases if errors estimated for lower orders do not
+    exceed that for k. It increases if k + 1 steps had order k, and the error for order k + 1 is below that for k. While
+    STARTING is 1, it rises in every step. `table`: predicted differences; `d`: evaluated minus predicted accelerations.
     """
     g, G = _row(memory, G_VELOCITY), _row(memory, G_POSITION)
     weight_v, weight_q = _scratch_rows(memory, n)

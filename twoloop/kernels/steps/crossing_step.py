@@ -26,31 +26,31 @@ from twoloop.kernels.evaluation.inner_loop import evaluate_state, project, renew
 from twoloop.kernels.linalg.dense import copy, sum_rows
 from twoloop.kernels.steps.stages import lagrange_values
 
-# indices in `options`: tolerances of the inner loop and of projections. The Gauss tableau follows: A, A @ A, weights of
-# the Legendre coefficients (S, S each); b, b @ A, c (S each)
+# indices in `options`: tolerances of the inner loop and of projections. The Gauss tableau follows: first A, A @ A and
+# weights that yield Legendre coefficients (S, S each); then b, b @ A and c (S each)
 INNER_TOL, THETA, N_SCALARS = range(3)
 S = 20  # number of Gauss nodes, which are the stages
 CONVERGED_CHANGE = 0.01  # the iteration has converged if a sweep changes accelerations by at most this (in tolerances)
 # the iteration has also converged if a sweep changes accelerations by at most STALL_CHANGE tolerances, and by at least
 # STALL_RATIO times the change by the sweep before: rounding errors then keep the change from decreasing
 STALL_RATIO, STALL_CHANGE = 0.5, 0.3
-MAX_SWEEPS, FEW_SWEEPS = 40, 12  # numbers of sweeps after which a step fails, and after which more nodes are left out
+MAX_SWEEPS, FEW_SWEEPS = 40, 12  # a step fails after MAX_SWEEPS; after FEW_SWEEPS, it leaves out more nodes than before
 DISTANCE_FACTOR = 2.0  # after FEW_SWEEPS sweeps, the pivot below which nodes are left out is multiplied by this
-MAX_LEFT_OUT_NODES = 9  # the step fails if more nodes are left out
-# indices of the scalars at the end of `memory`. LARGEST_PIVOT, EARLIEST, MAY_APPROACH, NODE_DISTANCE, BASE (a time, s):
-# arguments of `begin_polynomial`. BEGIN, DURATION, END (s): of the polynomial of the last converged attempt; if there
-# is none, END = -inf
+MAX_LEFT_OUT_NODES = 9  # a step fails if more nodes than this are left out
+# indices of the scalars at the end of `memory`. LARGEST_PIVOT to NODE_DISTANCE store arguments of `begin_polynomial`,
+# and BASE the time (s) of its argument `base`. BEGIN, DURATION and END store the beginning, duration and end (s) of the
+# polynomial that the last converged attempt computed; if there is none, END contains -inf
 LARGEST_PIVOT, EARLIEST, MAY_APPROACH, NODE_DISTANCE, BASE, BEGIN, DURATION, END, N_STORED = range(9)
 SHORTEST_PIECE, LONGEST_PIECE = 0.05, 0.2  # limits of the steps along a polynomial, relative to its duration
 NODE_GAP = 0.0767  # longest time between two successive nodes, relative to the duration of the polynomial
 BACKWARD_FRACTION = 0.4  # largest part of the polynomial that precedes the step, relative to its whole duration
-ORDER, ERROR_FACTOR = 12.0, 0.5  # the error estimate is about proportional to h^ORDER; factor on the estimate
+ORDER, ERROR_FACTOR = 12.0, 0.5  # the error estimate has the factor ERROR_FACTOR, and is about proportional to h^ORDER
 PROJECTION_WEIGHT = 0.5  # if a projection changes a stage by x tolerances, the error estimate is at least this times x
 ROUNDING = 1e-13  # relative tolerance of the iteration in steps of fixed size, and of comparisons of times
 MIN_PIVOT_RATIO = 0.5  # a step fails if the pivot at its end is below this * pivot at its beginning; see FAR_END
 END_MARGIN = 2.0  # a step fails if the pivot at its end is below this * smallest pivot allowed at nodes; see FAR_END
-FAR_END = 0.3  # MIN_PIVOT_RATIO and END_MARGIN do not matter if the pivot at the end is at least this * largest pivot
-LATE = S - 4  # node near the end: if the pivot is larger there than at the end, the end is before the singular position
+FAR_END = 0.3  # the pivot at the end of a step is large enough if it is at least this * largest pivot of the run so far
+LATE = S - 4  # node near a polynomial's end: if its pivot exceeds the end's, the singular position lies beyond the end
 # an attempt that computes a polynomial returns this as error and as step-size factor. So the step is repeated; it then
 # follows the polynomial
 REPEAT_FACTOR = 2.0
@@ -74,8 +74,8 @@ def begin_polynomial(memory, largest_pivot, earliest, may_approach, node_distanc
 
     `largest_pivot` is the largest pivot of the run so far; no node may lie before the time `earliest` (s). If
     `may_approach`, the polynomial may end before the singular position, nearer to it than it begins. `node_distance`
-    is a factor on the pivot below which nodes are left out. The polynomial goes through q and v of `base`, the time (s)
-    and the state [q, v, ...] of a step farther from the singular position; if None, of the beginning of the step.
+    is a factor on the pivot below which nodes are left out. The polynomial goes through `base`, the time (s) and state
+    [q, v, ...] of an earlier step; if `base` is None, it goes through the state at the beginning of the step.
     """
     stored = memory[-N_STORED:]
     stored[:] = np.nan
@@ -87,7 +87,7 @@ def begin_polynomial(memory, largest_pivot, earliest, may_approach, node_distanc
 
 
 def piece_ends(memory, c, t):
-    """Divide the polynomial in `memory` into the next steps ("pieces"); return the times (s) after t at which they end.
+    """Divide the polynomial in `memory`, from t on, into steps ("pieces"); return the times (s) at which they end.
 
     Pieces end at the end of the polynomial, at evaluated nodes next to a node that is left out, and at evaluated nodes
     where the piece would otherwise be longer than LONGEST_PIECE. No piece is shorter than SHORTEST_PIECE.
@@ -171,9 +171,9 @@ def _choose_partition_at_end(
 ):
     """Set (q1, v1) to the end (at time t) of the polynomial of duration h; choose the partition there; return a code.
 
-    The code is SINGULAR if the end is close to the singular position, or before it: its pivot is below FAR_END times
-    the largest pivot, and below a second limit. This limit is `min_pivot`; if MAY_APPROACH is 0, it is the largest of
-    `min_pivot`, END_MARGIN times `min_node_pivot` (below which nodes are left out), and the pivot at the node LATE.
+    The code is SINGULAR if the end is close to the singular position, or before it. Then the pivot at the end is below
+    FAR_END times the largest pivot of the run, and below `min_pivot`. If MAY_APPROACH is 0, `min_pivot` is first raised
+    to the pivot at the node LATE, and to END_MARGIN times `min_node_pivot`, the pivot below which nodes are left out.
     """
     A, AA, b, bA, c = tables
     if stored[MAY_APPROACH] == 0.0:
@@ -187,7 +187,7 @@ def _choose_partition_at_end(
 
 @compiled
 def _fill_integral_weights(b, c, c0, weights_v, weights_q):
-    """Store weights (S) of a polynomial's values at the nodes c in its integral and double integral from 0 to c0."""
+    """Store weights (S) that yield a polynomial's integral and double integral, 0 to c0, from its values at nodes c."""
     weights_v[:] = 0.0
     weights_q[:] = 0.0
     for i in range(S):
@@ -212,7 +212,7 @@ def _set_beginning_state(h, c0, weights_v, weights_q, a, q, v, q_0, v_0):
 
 @compiled
 def _interpolate(x, c, nodes, a, value):
-    """Set `value` (n) to the value at x of the polynomial that is a[k] (n) at c[k] for all k in `nodes` except -1."""
+    """Set `value` (n) to the value at x of the polynomial through a[k] (n) at c[k], for all k in `nodes` except -1."""
     value[:] = 0.0
     for node in nodes:
         if node >= 0:
@@ -286,14 +286,14 @@ def state_at(memory, options, t):
 
 @kernel(ATTEMPT)
 def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """Attempt a step along the polynomial in `memory`; if it ends before the step does, compute a new polynomial."""
+    """Attempt a step along the polynomial in `memory`; if the step ends beyond this polynomial, compute a new one."""
     n = w.Q.size
     q, v, q1, v1 = state[:n], state[n : 2 * n], new_state[:n], new_state[n : 2 * n]
     A, AA, legendre = options[N_SCALARS : N_SCALARS + 3 * S * S].reshape((3, S, S))
     b, bA, c = options[N_SCALARS + 3 * S * S :].reshape((3, S))
     a, stage, offset = memory[: S * n].reshape((S, n)), memory[S * n : (S + 5) * n].reshape((5, n)), (S + 7) * n
     q_stage, v_stage, a_stage, q_0, v_0 = stage[0], stage[1], stage[2], stage[3], stage[4]
-    kept, weights_v, weights_q = memory[offset : offset + 3 * S].reshape((3, S))  # `kept`: node number; -1: left out
+    kept, weights_v, weights_q = memory[offset : offset + 3 * S].reshape((3, S))  # kept[j]: j; -1: node j is left out
     stored = memory[offset + 3 * S :]
     largest_pivot, earliest, time_of_base = stored[LARGEST_PIVOT], stored[EARLIEST], stored[BASE]
     is_estimated, uses_generated_code = tolerances[ESTIMATE] == 1.0, f.is_generated == 1
@@ -314,7 +314,7 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
         if is_estimated:
             duration = h + max(0.0, min(h * BACKWARD_FRACTION / (1.0 - BACKWARD_FRACTION), t - earliest))
     begin, c0 = t + h - duration, (duration - h) / duration
-    c_base = c0 if t_base == t else 0.0  # time of the state `base`, as a fraction of the polynomial
+    c_base = c0 if t_base == t else 0.0  # time from the polynomial's beginning to `base` / its duration
     _fill_integral_weights(b, c, c_base, weights_v, weights_q)
     n_before_base = 0  # number of nodes before the state `base`
     while n_before_base < S and c[n_before_base] < c_base:
@@ -356,7 +356,7 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
             if chooses_nodes:
                 code = renew_partition(f, w, time, q_stage)
                 kept[j] = j
-                if code == DONE:  # if the run began near a singular position, this pivot may be the largest
+                if code == DONE:  # this pivot may be the largest of the run, if the start was near a singular position
                     stored[LARGEST_PIVOT] = largest_pivot = max(largest_pivot, w.pivot)
                 if is_estimated and (code != DONE or w.pivot < min_node_pivot * largest_pivot):
                     kept[j], n_kept, code = -1.0, n_kept - 1, DONE

@@ -106,7 +106,7 @@ def factor_newton_matrix(w, memory, z):
         if ldl_factor(H):
             memory[at.IS_SYMMETRIC] = 1.0
             return DONE
-        # L D L^T fails if the matrix is indefinite (for example, with a compressed beam): fill it again, and use L U
+        # L D L^T fails if the matrix is indefinite, for example with a compressed beam: fill the matrix again, use L U
         _fill_newton_matrix(w, memory, n, m, z, storage)
     return DONE if lu_factor(H, pivots_of(memory, 1, n, 0)) > 0.0 else SINGULAR
 
@@ -115,7 +115,7 @@ def factor_newton_matrix(w, memory, z):
 def compute_and_factor_matrix(f, w, tolerances, memory, t, q, v, z):
     """Compute the derivatives of forces at (t, q, v), and factor Newton's matrix with them; return a code.
 
-    The last evaluation must have been at (t, q, v), w.lam must be the multipliers there. z: step size times gamma.
+    The last evaluation must have been at (t, q, v), and w.lam must be its multipliers. z: step size times gamma.
     """
     n = q.size
     m = w.independent.size
@@ -152,7 +152,7 @@ def _solve_newton_system(w, memory, x):
 
 @compiled
 def correct_stage(w, memory, residual, a):
-    """Replace `residual` by Newton's correction of the accelerations a, and add it to a: independent entries only."""
+    """Replace independent entries of `residual` by Newton's corrections, and add these to the accelerations a."""
     n = w.Q.size
     m = w.independent.size
     N, x = as_matrix(matrix_storage(w, n, at.SYSTEMS), m), vector(memory, 1, n, at.V_MOVED)[:m]
@@ -222,7 +222,7 @@ def stages_at_once(options):
 
 @compiled
 def _update_derivatives(f, w, options, tolerances, memory, t, h, Q, V, F):
-    """Renew outdated derivatives, at the state (t, Q, V) with accelerations F, and Newton's factors; return a code."""
+    """If they are outdated, compute derivatives at (t, Q, V; accelerations F) and Newton's factors; return a code."""
     if f.force_by_q_given == 1 or memory[at.HAS_JACOBIAN] == 0.0:
         multipliers(f, w, t, Q, V, F, w.lam)
         memory[at.HAS_JACOBIAN] = 1.0
@@ -315,10 +315,10 @@ MAX_RATIO_BY_ONE_JUMP = 0.174
 
 @compiled
 def _filter_errors(f, w, options, memory, h, e_q, e_v):
-    """Remove stiff components of estimated errors: replace (e_q, e_v) by (I - z J)^-1 (e_q, e_v), by the last factors.
+    """Remove stiff components of the estimated errors (e_q, e_v): multiply them by (I - z J)^-1, using stored factors.
 
-    z = h gamma; J is the Jacobian of velocities and accelerations by (q_i, v_i). The estimated errors of q and v are
-    the first n_dof entries of e_q and e_v (n_q); the other entries are scratch.
+    z = h gamma; J is the Jacobian of velocities and accelerations by (q_i, v_i), the independent entries. The estimated
+    errors of q and v are the first n_dof entries of e_q and e_v (n_q); the other entries are scratch.
     """
     z = h * gamma_of(options)
     n_dof = w.independent.size
@@ -340,7 +340,7 @@ def _factor_filter(f, w, options, memory, h):
 
 @compiled
 def _store_weighted_sums(w, h, V_stage, A_stage, weights, factor, e_q, e_v):
-    """Estimate errors of independent q and v: e_q = h factor sum_k weights[k] V_stage[k]; e_v: the same of A_stage."""
+    """Estimate errors of independent q and v: e_q, e_v = h factor sum_k weights[k] (V_stage[k], A_stage[k])."""
     for i in range(w.independent.size):
         j = w.independent[i]
         sum_q, sum_v = 0.0, 0.0
@@ -374,10 +374,10 @@ def _renew_derivatives(f, w, options, tolerances, memory, t, h, new_state):
 
 @compiled
 def _estimate(f, w, options, memory, t, h, tolerances, state, new_state, V_stage, A_stage, weights, factor):
-    """Estimate the error of a step by `weights` of its stages; return its largest component, in units of tolerances.
+    """Estimate the error of a step by sums of its stages times `weights`; return its largest component in tolerances.
 
-    The estimate is filtered (Hosea and Shampine 1996), so that stiff components do not count. If outdated derivatives
-    make the filter wrong, they are computed anew. E_Q and E_V in `memory` become the twice filtered estimate.
+    Stiff components do not count, because the estimate is filtered (Hosea and Shampine 1996). If derivatives are so old
+    that the filter is wrong, they are computed anew. At the end, E_Q and E_V contain the estimate filtered twice.
     """
     n = w.Q.size
     q, v, q1, v1 = state[:n], state[n : 2 * n], new_state[:n], new_state[n : 2 * n]
@@ -433,7 +433,7 @@ def _apply_embedded_formula(f, w, options, memory, h, q1, v1):
 def _error_in_slow_directions(f, w, options, memory, h, tolerances, state, new_state, A_stage):
     """Return the effect, in tolerances, of the slowly decaying part of the estimated velocity error E_V in `memory`.
 
-    If E_V has an effect of at most 1, return 0. E_Q, E_V and the factors are overwritten. See newton_step.py.
+    If all of E_V has an effect of at most 1, return 0. E_Q, E_V and Newton's factors are overwritten.
     """
     n = w.Q.size
     e_q, e_v = vector(memory, 1, n, at.E_Q), vector(memory, 1, n, at.E_V)
@@ -461,7 +461,7 @@ def _error_at_jumps(f, w, options, memory, t, h, tolerances, state, new_state, V
     The first estimate has small weights in the first half of the step, and hardly shows a jump there. `jump_weights`
     (s) belong to another embedded formula. The sum of jump_weights[k] A_stage[k] is zero if the accelerations are
     quadratic in time, small relative to their range if they are smooth, and large if they jump. The second estimate
-    contains the ratio of this sum to the range as a factor, which makes its order higher.
+    is multiplied by the ratio of this sum to the range, so that it is of higher order in smooth motion.
     """
     n = w.Q.size
     deviation, widest = 0.0, 0.0
@@ -489,7 +489,7 @@ def commit_diagonal(f, w, options, memory, tolerances, accepted):
     if accepted:
         s = int(options[at.DIAGONAL_OFFSET])
         _, A_stage, a_end = stage_views(memory, s, w.Q.size)
-        copy(A_stage[s - 1], a_end)  # not those at the new state, in which stiffness amplifies Newton's last error
+        copy(A_stage[s - 1], a_end)  # in accelerations at the new state, stiffness would amplify Newton's last error
         memory[at.IS_FRESH] = 0.0
 
 

@@ -76,7 +76,7 @@ def tableau_of(options):
 
 @inlined
 def _vector_view(memory, n, index):
-    """Return a view (2 n, padded) of the vector number `index`, such as STAGE_STATE, in `memory`."""
+    """Return a view (2 n, padded) of the vector with this `index`, such as STAGE_STATE, in `memory`."""
     return memory[index * _padded_width(n) : (index + 1) * _padded_width(n)]
 
 
@@ -138,7 +138,7 @@ def explicit_step(f, w, options, memory, t, h, tolerances, state, new_state):
     )
     begin, width = N_VECTORS * _padded_width(n), _padded_width(n)
     slopes = memory[begin : begin + s * width].reshape((s, width))  # velocities and accelerations of each stage
-    # stages are always projected near a singular position: else they might be beyond it, or have inaccurate velocities
+    # near a singular position, all stages are projected: otherwise, they could be beyond it, or their velocities wrong
     is_near = options[FREE] == 1.0 and w.nearly_singular != 0.0
     is_free = options[FREE] == 1.0 and not is_near
     ratio_to_gap = gap_ratio(tolerances, h)
@@ -147,7 +147,7 @@ def explicit_step(f, w, options, memory, t, h, tolerances, state, new_state):
     w.n_outer += 1
     copy(state[n : 3 * n], slopes[0])
     for j in range(1, s):
-        _add_weighted_slopes(y, h, A[j, :j], slopes, stage, stage)  # for dependent coordinates, only first guesses
+        _add_weighted_slopes(y, h, A[j, :j], slopes, stage, stage)  # dependent coordinates in `stage` are first guesses
         v_stage, a_stage = slopes[j, :n], slopes[j, n : 2 * n]
         copy(stage[n : 2 * n], v_stage)
         if is_free:

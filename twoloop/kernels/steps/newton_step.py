@@ -201,11 +201,11 @@ def _estimate_error(f, w, options, memory, h, tolerances, state, new_state, A_st
 
 @compiled
 def _error_in_slow_directions(f, w, options, memory, h, tolerances, state, new_state):
-    """Return the effect (see `velocity_error`) of the slowly decaying part of a velocity error, in tolerances.
+    """Return the error, in tolerances, that the slowly decaying part of a step's velocity error causes in q or v.
 
-    The velocity error is the vector E_V of `memory`. `filtered_velocity_error` assumes that all components last only as
-    long as the fastest one. Here, a filter keeps the part that remains after STEPS_TO_DECAY steps; this part is assumed
-    to last for `motion_time`. If even all of E_V has an effect of at most 1, return 0. E_Q, E_V are overwritten.
+    E_V in `memory` is the velocity error. `filtered_velocity_error` assumes that all components of it last only as long
+    as the fastest one. Here, a filter keeps the part that remains after STEPS_TO_DECAY steps; this part is assumed to
+    last for `motion_time`. If unfiltered E_V would cause an error of at most 1, return 0. E_Q, E_V are overwritten.
     """
     s, n = int(options[STAGES]), w.Q.size
     z = STEPS_TO_DECAY * h / options[newton_options_index(s) + at.GAMMA0]
@@ -257,8 +257,8 @@ def newton_step(f, w, options, memory, t, h, tolerances, state, new_state):
     node = middle_node(c)
     while True:
         if memory[at.HAS_JACOBIAN] == 0.0:
-            # compute derivatives at the middle stage, where stiff directions differ least from those at other stages,
-            # and not at the middle of the step: a short force might act there that acts at no stage
+            # compute derivatives at the middle stage: its stiff directions differ least from those at other stages. At
+            # the middle of the step, a short force that acts at no stage might change the derivatives
             dt = node * h
             for m in range(n):
                 q_mid[m] = q[m] + dt * (v[m] + 0.5 * dt * a[m])
@@ -289,8 +289,8 @@ def newton_step(f, w, options, memory, t, h, tolerances, state, new_state):
             break
         if memory[at.IS_FRESH] == 1.0 and (node == 0.0 or code != OUTER_DIVERGED):
             return Attempt(code, np.inf, 0.0)
-        # no convergence: compute new derivatives, and try again. Derivatives that are already new may be wrong (as for
-        # friction), because the middle stage is extrapolated: then compute them at the beginning of the step
+        # Newton's method failed: try again with new derivatives. If they were new already, compute them at the start of
+        # the step: derivatives at the middle stage, an extrapolated state, may be wrong, for example with friction
         if memory[at.IS_FRESH] == 1.0:
             node = 0.0
         memory[at.HAS_JACOBIAN] = 0.0

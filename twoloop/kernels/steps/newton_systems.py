@@ -1,7 +1,7 @@
-"""Solve linear systems of Newton's method in implicit steps: I - z^2 J_q - z J_v, z = h l, for each eigenvalue l of A.
+"""Solve the linear systems of Newton's method in implicit steps: one for each eigenvalue l of the tableau's matrix A.
 
-A is the matrix of the Butcher tableau, h the step size. J_q and J_v are the derivatives of the accelerations by the
-independent positions and velocities. The corrections x of the independent accelerations a_i solve
+Let z be h l, where h is the step size. J_q and J_v are the derivatives of the accelerations by the independent
+positions and velocities. The corrections x of the independent accelerations a_i solve
 (I - z^2 J_q - z J_v) x = r, where r is the residual of the equations for a_i. The velocities that the constraints allow
 are v = T v_i, T = [I; -Cqd^-1 Cqi], where Cqd and Cqi are the dependent and independent columns of C_q. Multiplied by
 T^T M T, the system becomes (`f`: kit, `w`: workspace)
@@ -10,8 +10,8 @@ T^T M T, the system becomes (`f`: kit, `w`: workspace)
 
 K and D, called tangents, are the derivatives of Q - Cq^T lam by q and v, at constant lam. This omits the dependence
 of T and M on q, and of gamma on v. The omitted terms are not stiff, and are zero for linear constraints, so that a
-simplified Newton's method does not need them. Under step-size control, steps are as long without them. Fixed steps in
-which a body turns by some 0.4 rad may fail without them, but converge with differences of the accelerations.
+simplified Newton's method does not need them. Under step-size control, steps are as long as with these terms. Without
+them, fixed steps in which a body turns by some 0.4 rad may fail; with differences of the accelerations, they converge.
 
 X = T x also solves a system with a bordered matrix, with Cq^T and Cq as the border,
 
@@ -96,8 +96,8 @@ def _displacement_sizes(tolerances, x):
 def _displaced(tolerances, x, sizes, j):
     """Return x_j plus a displacement for finite differences.
 
-    It is RELATIVE_DISPLACEMENT times the largest of |x_j|, the typical size, and atol_j / rtol or the largest |x| if
-    that is less: in large units, displacements would otherwise be rounding errors where x_j is zero.
+    It is RELATIVE_DISPLACEMENT * max(|x_j|, typical size, min(max|x|, atol_j / rtol)). Without the last of these three
+    sizes, the displacement would be a rounding error where x_j is zero, but other numbers in x are large.
     """
     size = max(sizes[0], abs(x[j]))
     if tolerances[RTOL] > 0.0:
@@ -146,7 +146,7 @@ def _has_jacobian_changed(f, w, t, q):
 def _subtract_reaction_tangent(f, w, tolerances, t, q, moved, b, K):
     """Subtract d(C_q^T lam)/dq, computed by differences, from the entries of K (n_q, n_q) with |i - j| <= b.
 
-    w.G must be C_q at (t, q). Coordinates j, j + 2 b + 1, ... affect different rows: displace them together (`moved`).
+    w.G must be C_q at (t, q). Coordinates j, j + 2 b + 1, ... affect different rows, and are displaced together.
     """
     n = q.size
     sizes = _displacement_sizes(tolerances, q)
@@ -352,10 +352,10 @@ def _band_view(numbers, n, b):
 
 @inlined
 def _border_views(w, n, r, b):
-    """Return views of copies made with K: independent rows of C_q (r, n), derivative of dependent velocities, indices.
+    """Return three arrays that were stored together with K: independent rows of C_q, w.D, and dependent coordinates.
 
-    w.D (n - r + 1, r): derivative by independent velocities, transposed; its last row contains the velocities due to
-    drives. The indices (r) are those of dependent coordinates. The copies are stored behind the band of K.
+    Sizes: (r, n), (n - r + 1, r), (r). w.D contains, transposed, the derivative of the dependent velocities by the
+    independent ones; its last row contains the dependent velocities due to C_t. The arrays follow the band of K.
     """
     numbers = matrix_storage(w, n, at.DERIVATIVE_Q)
     start = n * (2 * b + 1)
@@ -433,7 +433,7 @@ def _fill_bands_from_callbacks(f, w, tolerances, memory, s, t, q, v, b):
 
 @compiled
 def _fill_banded_tangents(f, w, tolerances, memory, s, t, q, v):
-    """Store the bands of K and D (derivatives of Q - C_q^T lam by q, v), and the arrays of `_border_views`."""
+    """Store bands of K and D (derivatives of Q - C_q^T lam by q, v) and arrays for `_border_views`; return a code."""
     n = q.size
     b = f.bandwidth
     w.n_jacobians += 1
@@ -473,7 +473,7 @@ def _fill_banded_tangents(f, w, tolerances, memory, s, t, q, v):
 
 @compiled
 def _factor_banded(w, memory, s, b, index, z, numbers, factorize, substitute):
-    """Factorize [[M - z^2 K - z D, Cq^T], [Cq, 0]], Newton's matrix with its border, in `numbers`; return a code.
+    """Store factors of Newton's bordered matrix [[M - z^2 K - z D, Cq^T], [Cq, 0]] in `numbers`; return a code.
 
     `index`: where pivots are stored, see `pivots_of`. `factorize`, `substitute`: LAPACK routines, complex if z is.
     """
@@ -534,8 +534,8 @@ def _filter_error_banded(f, w, options, memory, s, h, e_q, e_v):
 
 # --- sparse storage, for all coordinates
 
-# the sparsity pattern of a derivative of the residual (K by q, D by v) lacks entries if derivative * displacement
-# differs from the change of the residual by more than this fraction of the sum of |terms| of the product
+# K lacks entries if a displacement d of q changes a component i of the residual by a number that differs from
+# sum_j K_ij d_j by more than this fraction of sum_j |K_ij d_j|. D, the derivative by v, is tested like K
 MAX_DEVIATION = 0.2
 RESIDUAL_ROUNDING = 1e-13  # rounding error of a difference of residuals, relative to the largest term of a residual
 N_SPARSE_VECTORS = 3  # number of real scratch vectors, which _sparse_scratch returns first
@@ -554,9 +554,9 @@ def matrices_size(program: np.ndarray, n_mass: int, n_jacobian: int, n_systems: 
 
 @inlined
 def _sparse_derivative_views(f, w):
-    """Return six views of w.matrices: the entries of M, G, K and D, and two arrays with a number for each row g of G.
+    """Return six views of w.matrices: the entries of M, G, K and D, then `is_independent` and `stiffness`.
 
-    Numbers in the first array: 1 if g is independent, else 0. In the second one: s if s g^T g is added to a singular M.
+    For each row g of G, `is_independent` is 1 or 0, and `stiffness` is s if s g^T g is added to a singular M.
     """
     n_mass, n_jacobian, n_rows = w.mass_values.size, w.jacobian_values.size, w.is_independent.size
     begin_K = n_mass + n_jacobian
@@ -604,7 +604,7 @@ def _sparse_factor_view(f, w, k):
 
 @compiled
 def _fill_sparse_residual(f, w, t, q, v, renews_G, out):
-    """Store the forces with reactions, Q - G^T w.lam, at (t, q, v) in `out` (n_q); return the largest |term|.
+    """Store the forces with reactions, Q - G^T w.lam, at (t, q, v) in `out` (n_q); return its largest |term|.
 
     The entries of G are in w.jacobian_values; if `renews_G`, evaluate them at (t, q) first.
     """
@@ -652,10 +652,10 @@ def _fill_tangent_entries_by_differences(f, w, tolerances, t, q, v, by_v, base, 
 
 @compiled
 def _has_complete_pattern(f, base, residual, base_point, moved, largest, entries, predicted):
-    """Return True if the sparse matrix K or D, given by its `entries`, predicts the change of the residual.
+    """Return True if K or D, given by its `entries`, predicts how the residual changes with a displacement.
 
     If not, its pattern lacks entries. `base`, `residual`: residuals at `base_point` (q or v) and at the displaced point
-    `moved`. `largest`: largest term of a residual, for rounding. `residual` and `predicted` (n_q) are overwritten.
+    `moved`. `largest`: largest term of a residual, see RESIDUAL_ROUNDING. `residual` and `predicted` are overwritten.
     """
     rows, columns, _ = tangent_entries_of(f.newton_program)
     predicted[:] = 0.0
@@ -672,7 +672,7 @@ def _has_complete_pattern(f, base, residual, base_point, moved, largest, entries
 
 @compiled
 def _fill_sparse_tangents(f, w, tolerances, memory, t, q, v):
-    """Store the sparse K and D (derivatives of the residual by q, v) at the last evaluated state; return a code.
+    """Store the sparse K and D (derivatives of Q - G^T lam by q, v) at the last evaluated state; return a code.
 
     The code is NEEDS_DENSE if there is no program for sparse storage, or if the pattern of K or D lacks entries.
     """
@@ -731,7 +731,7 @@ def _factor_sparse_matrix(f, w, z, factors):
 
 @compiled
 def _fill_sparse_right_side(f, w, r, right):
-    """Store [M r; G r] in `right`: right-hand side for residuals r of accelerations; add terms of redundant rows."""
+    """Store in `right` [M r; G r] (r: residual), plus terms of redundant rows g with s g^T g in M."""
     mass, jacobian, _, _, is_independent, stiffness = _sparse_derivative_views(f, w)
     right[:] = 0.0
     rows, columns, _ = mass_entries_of(f.newton_program)
@@ -765,7 +765,7 @@ def _filter_error_sparse(f, w, options, s, h, e_q, e_v):
 def fill_derivatives(f, w, options, tolerances, memory, s, t, q, v, a):
     """Store the derivatives for Newton's matrix at the last evaluated state (t, q, v); return DONE or an error code.
 
-    In dense storage, these are derivatives of accelerations, else of forces. `a`: accelerations at this state.
+    In dense storage, these are derivatives of accelerations, otherwise of forces. `a`: accelerations at this state.
     """
     if f.form == FIXED_ORDER:
         return _fill_sparse_tangents(f, w, tolerances, memory, t, q, v)
@@ -785,7 +785,7 @@ def _factor_system(f, w, memory, s, index, z, numbers, factorize, substitute):
 
 @compiled
 def factor_filter(f, w, options, memory, s, h):
-    """Factorize I - z^2 J_q - z J_v, z = h gamma0 (see GAMMA0), the matrix of `filter_error`; return a code."""
+    """Factorize the matrix I - z^2 J_q - z J_v of `filter_error`, where z is step size h * GAMMA0; return a code."""
     z = h * options[newton_options_index(s) + at.GAMMA0]
     if f.form == FIXED_ORDER:
         return _factor_sparse_matrix(f, w, z, _sparse_factor_view(f, w, 0))
@@ -794,13 +794,13 @@ def factor_filter(f, w, options, memory, s, h):
 
 @compiled
 def factor_systems(f, w, options, memory, s, h):
-    """Factorize the matrices of a step of size h: of `filter_error`, and of each system of Newton's method."""
+    """For steps of size h, factorize the matrix of `filter_error` and those of Newton's method; return a code."""
     offset = newton_options_index(s)
     n_systems, n_real = count_systems(options, s), int(options[offset + at.N_REAL])
     code = factor_filter(f, w, options, memory, s, h)
     offset += at.N_EIGEN_SCALARS + s
     for k in range(n_systems):
-        # if the first eigenvalue is real, it is gamma0, and `factor_filter` has already computed its factors
+        # if the first eigenvalue is real, it is GAMMA0, and `factor_filter` has already factorized the first matrix
         if code == DONE and (k > 0 or n_real == 0):
             z = h * complex(options[offset], options[offset + 1])
             if f.form == FIXED_ORDER:
@@ -840,7 +840,7 @@ def solve_system(f, w, options, memory, s, k, x):
     If this eigenvalue is real, only the real part of x is used, and the solution is real.
     """
     n = w.Q.size
-    if k == 0 and options[newton_options_index(s) + at.N_REAL] > 0.0:  # the first eigenvalue is real: it is gamma0
+    if k == 0 and options[newton_options_index(s) + at.N_REAL] > 0.0:  # the eigenvalue is real, and equals GAMMA0
         real_part, X = vector(memory, s, n, at.V_MOVED), vector(memory, s, n, at.Q_MOVED)
         for i in range(x.size):
             real_part[i] = x[i].real
@@ -889,7 +889,7 @@ def correct_stages(f, w, options, memory, s, residual, A_stage):
     n_systems = count_systems(options, s)
     x = complex_vector(memory, s, n, n_systems, 0)
     offset += at.N_EIGEN_SCALARS + s
-    corrections = block(memory, s, n, at.Q_STAGE)  # scratch here: later, stage positions are computed anew
+    corrections = block(memory, s, n, at.Q_STAGE)  # overwrites stage positions, which are computed anew later
     corrections[:, :] = 0.0
     for k in range(n_systems):
         begin_row = offset + 2

@@ -26,7 +26,7 @@ END_ERROR_WEIGHT = 0.01
     INNER_TOL,  # tolerance of the inner loop
     OUTER_TOL,  # tolerance of the outer loop
     EXTRAPOLATION,  # factor 1 / (2^order - 1) in Richardson's extrapolation of the new state; 0: no extrapolation
-    OUTER_TEST,  # 1: the outer loop ends when all coordinates have converged; 0: when the independent ones have
+    OUTER_TEST,  # 1: the outer loop ends when all coordinates have converged; 0: when independent coordinates have
     POWER,  # order of the method minus 1, an exponent in `estimate_end_error`
     N_SCALARS,
 ) = range(7)
@@ -42,7 +42,7 @@ def options_array(
     outer_test: float = 1.0,
     power: float = 0.0,
 ) -> NDArray[np.float64]:
-    """Return the array `options` of a method; A, b, c: Butcher tableau; other arguments: see STAGES and below it."""
+    """Return the array `options` of a method; A, b, c: Butcher tableau; other arguments: see INNER_TOL to POWER."""
     A, b, c = np.asarray(A), np.asarray(b), np.asarray(c)
     scalars = np.array([float(len(b)), inner_tol, outer_tol, extrapolation, outer_test, power])
     vectors = (b, b @ A, c, lagrange_values(c, 0.0), lagrange_values(c, 1.0))
@@ -79,7 +79,7 @@ def middle_node(c):
 
 @compiled
 def interpolate(c, theta, A_stage, weights, a):
-    """Interpolate the stage accelerations A_stage (s, n) at the nodes c (s); store their values at theta in a (n).
+    """Interpolate stage accelerations A_stage (s, n) from the nodes c (s) to the time theta; store the result in a (n).
 
     Nodes and theta are times relative to the step size. `weights` (s) is scratch.
     """
@@ -133,30 +133,30 @@ def estimate_end_error(tolerances, options, h, state, new_state, A_stage):
 
 
 # indices of the scalars in the part of `options` for Newton's method, counted from the beginning of this part. The
-# weights (s) of the error estimate follow. Then the part contains for each eigenvalue of the tableau's A the real and
-# imaginary part of the eigenvalue, its row of X^-1, and its column of X (of each, s real, then s imaginary parts),
-# where the columns of X are the eigenvectors of A
+# weights (s) of the error estimate follow. Then, for each eigenvalue of the tableau's matrix A, the part contains its
+# real and imaginary part, a row of X^-1 and a column of X, where the columns of X are the eigenvectors of A. A row or
+# a column is stored as s real parts, then s imaginary parts
 (
     N_REAL,  # number of real eigenvalues of the matrix A of the Butcher tableau
     N_PAIRS,  # number of pairs of conjugate complex eigenvalues of the matrix A of the Butcher tableau
-    GAMMA0,  # constant of the error filter: first real eigenvalue of the tableau's A, else smallest |eigenvalue|
+    GAMMA0,  # constant of the error filter: first real eigenvalue of the tableau's A; if none is real, min |eigenvalue|
     TESTS_VELOCITIES,  # 1: limit the estimated velocity errors themselves; 0: limit their effects, see `velocity_error`
     N_EIGEN_SCALARS,
 ) = range(5)
 
 # indices of the scalars in `memory`, the array in which a method keeps data from step to step
 (
-    HAS_TRIAL,  # 1: a step was attempted (its stage accelerations are in the block TRIAL, except in diagonal_step.py)
+    HAS_TRIAL,  # 1: a step was attempted, with stage accelerations in TRIAL (except in diagonal_step.py); 0: no step
     H_TRIAL,  # size of the last attempted step (s)
-    HAS_PREVIOUS,  # 1: the block PREVIOUS contains the stage accelerations of the last accepted step
+    HAS_PREVIOUS,  # 1: the block PREVIOUS contains the stage accelerations of the last accepted step; 0: it is empty
     H_PREVIOUS,  # size of the last accepted step (s)
     HAS_JACOBIAN,  # 1: Newton's method may use the stored derivatives of accelerations or forces; 0: compute new ones
     IS_FRESH,  # 1: the stored derivatives belong to the stages of this step; 0: to earlier stages, or to a step's end
-    PARTITION_NUMBER,  # number of partitions of coordinates (w.generation) when the stored derivatives were computed
+    PARTITION_NUMBER,  # value of w.generation, which counts partitions, when the stored derivatives were computed
     H_FACTORED,  # step size (s) for which the linear systems of Newton's method are factored; 0: no factors are stored
-    CONTRACTION,  # ratio of the last correction of Newton's method to the one before
+    CONTRACTION,  # (last correction of Newton's method) / (the correction before it)
     HAS_DAMPING,  # 1: forces depend on velocities; 0: they do not, so that derivatives by velocities are zero
-    IS_SYMMETRIC,  # 1: Newton's matrix in diagonal_step.py is symmetric, with factors L D L^T; 0: with factors L U
+    IS_SYMMETRIC,  # 1: Newton's matrix in diagonal_step.py is symmetric, and factored as L D L^T; 0: factored as L U
     ERROR_DURATION,  # time (s) for which a velocity error changes positions, see velocity_errors.py; 0: unknown
     DERIVATIVES_RENEWED,  # 1: diagonal_step.py has computed new derivatives at the end of the step; 0: it has not
     N_MEMORY_SCALARS,
@@ -173,16 +173,16 @@ A_NEW, Q_MOVED, V_MOVED, E_Q, E_V, Q_MID, V_MID, A_MID, N_VECTORS = range(9)
 # - DERIVATIVE_Q: J_q. In banded storage: the band of K, rows of C_q and their null space. In diagonal_step.py: T^T K T
 # - DERIVATIVE_V: J_v. In banded storage: the band of D. In diagonal_step.py: T^T D T
 # - FILTER: factors of the real matrix with which error estimates are filtered
-# - SYSTEMS: for each eigenvalue of the tableau's A, two parts: a complex matrix, factored. In diagonal_step.py: T^T M T
+# - SYSTEMS: for each eigenvalue of the tableau's A, factors of a complex matrix (2 parts). In diagonal_step.py: T^T M T
 DERIVATIVE_Q, DERIVATIVE_V, FILTER, SYSTEMS = range(4)
 
 
 def newton_options(
     A: NDArray[np.float64], b: NDArray[np.float64], c: NDArray[np.float64], tests_velocities: bool
 ) -> NDArray[np.float64]:
-    """Return the part of `options` for Newton's method: eigenvalues and eigenvectors of the tableau's A, and others.
+    """Return the part of `options` for Newton's method (see N_REAL), with the eigenvalues of the tableau's matrix A.
 
-    A, b, c: Butcher tableau; A must be diagonalizable. `tests_velocities`: value of TESTS_VELOCITIES. See N_REAL.
+    A, b, c: Butcher tableau; A must be diagonalizable. `tests_velocities`: value of TESTS_VELOCITIES.
     """
     values, vectors = np.linalg.eig(A)
     inverse = np.linalg.inv(vectors)
@@ -246,8 +246,8 @@ def diagonal_options(
 
     The first row of A is zero, the other diagonal entries are gamma, and the last row is b, the weights of the method.
     `weights` (s): b minus the weights of the embedded formula. `jump_weights` (s): weights of the stage accelerations
-    in the error estimate for accelerations that jump. `embedded`: True if steps with an error estimate end at the
-    result of the embedded formula, which has a higher order.
+    in the error estimate for accelerations that jump. `embedded`: True if, under step-size control, steps end at
+    the result of the embedded formula, which has a higher order.
     """
     A, c, weights, jump_weights = (np.asarray(x, dtype=np.float64) for x in (A, c, weights, jump_weights))
     gamma = A[-1, -1]
@@ -273,7 +273,7 @@ def newton_options_index(s):
 
 @merged
 def count_systems(options, s):
-    """Return the number of linear systems of Newton's method: one for each real eigenvalue or complex pair of A."""
+    """Return the number of linear systems of Newton's method: N_REAL + N_PAIRS eigenvalues of the tableau's A."""
     offset = newton_options_index(s)
     return int(options[offset + N_REAL] + options[offset + N_PAIRS])
 
@@ -320,7 +320,7 @@ def _storage_after_vectors(memory, s, n, k):
 
 @inlined
 def pivots_of(memory, s, n, k):
-    """Return a view (n) of `memory`: pivot indices of the factored filter (k = 0), or linear system k - 1 (k > 0)."""
+    """Return a view (n) of `memory` with pivot indices: if k = 0, those of FILTER; if k > 0, of linear system k - 1."""
     return _storage_after_vectors(memory, s, n, k)[:n].view(np.int64)
 
 

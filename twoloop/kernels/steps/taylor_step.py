@@ -11,8 +11,8 @@ finds these orders for any equations). The right-hand sides r_k and c_k are comp
 `twoloop.generate.series`, with recurrences for Taylor coefficients (R. E. Moore, Interval Analysis (1966), ch. 11).
 
 The order of the series depends on the tolerance. The step size is such that the last terms of the series equal the
-tolerance (A. Jorba and M. Zou, Experimental Mathematics 14 (2005), 99-117). Coefficients are scaled by a unit of time,
-about the step size, so that they neither underflow nor overflow. The end of the step is projected onto the constraints.
+tolerance (A. Jorba and M. Zou, Experimental Mathematics 14 (2005), 99-117). The unit of time is about the step size,
+so that coefficients neither underflow nor overflow. The end of the step is projected onto the constraints.
 
 If there is no generated code, the program of the series is interpreted, order by order. `f`: kit, `w`: workspace.
 """
@@ -45,26 +45,26 @@ from twoloop.kernels.linalg.saddle_point import solve_with_multipliers
     ORDER,  # order of the Taylor series of the positions q
     THETA,  # a projection has converged if its last correction is at most this, see `project`
     N_NODES,  # number of quantities of the series program: inputs, unknowns and results of operations
-    EARLY_WIDTH,  # number of operations on t and q only (early operations), rounded up to a multiple of eight
-    LATE_WIDTH,  # number of operations on velocities, too (late operations), rounded up to a multiple of eight
+    EARLY_WIDTH,  # number of early operations (on t and q only), rounded up to a multiple of eight
+    LATE_WIDTH,  # number of late operations (on t, q and v), rounded up to a multiple of eight
     KEEP,  # 1: all steps are parts of one long step, and use the series about its beginning; 0: each step has its own
     N_SCALARS,
 ) = range(7)
 # 13 arrays describe a list of operations (OperationGroups in twoloop.generate.series). Array 0 contains the groups of
 # operations of the same kind, arrays 1 to 6 the first argument of each operation, arrays 7 to 12 the second argument
 GROUPS, FIRST, SECOND, N_TABLE = 0, 1, 7, 13
-# six arrays describe a list of affine expressions (Sums in twoloop.generate.series), such as the first arguments.
-# COLUMN, COEFFICIENT: quantity and factor of the first term of each expression. CONSTANT: constant of each expression.
-# ROW, MORE_COLUMN, MORE_COEFFICIENT: expression, quantity and factor of each further term
+# six arrays describe a list of affine expressions (Sums in twoloop.generate.series), such as first arguments. For each
+# expression, three of them have the quantity (COLUMN) and factor (COEFFICIENT) of its first term, and its CONSTANT. For
+# each other term, the other three have its expression (ROW), quantity (MORE_COLUMN) and factor (MORE_COEFFICIENT)
 COLUMN, COEFFICIENT, CONSTANT, ROW, MORE_COLUMN, MORE_COEFFICIENT, N_SUMS = range(7)
 SUM_INDICES = N_SUMS  # seventh array of ROWS and BALANCE: index of the equation that each affine expression belongs to
 # the series program is a list of arrays; its four parts begin at these indices. EARLY: operations on t and q only.
-# LATE: operations on velocities, too. ROWS, BALANCE: affine expressions for G v + (C_t, b) and Q - G^T lam - M a
+# LATE: operations on t, q and v. ROWS, BALANCE: affine expressions for G v + (C_t, b) and Q - G^T lam - M a
 EARLY, LATE, ROWS = 0, N_TABLE, 2 * N_TABLE
 BALANCE, N_ARRAYS = ROWS + N_SUMS + 1, ROWS + 2 * (N_SUMS + 1)
-# columns of the array GROUPS, which has a row for each group of operations. KIND: kind of operation. BEGIN, END: range
-# of the operations. MORE_FIRST and next column: range, in MORE_COLUMN, of the further terms of first arguments.
-# MORE_SECOND and next column: range, in MORE_COLUMN, of the further terms of second arguments
+# columns of the array GROUPS, which has a row for each group of operations. KIND: kind of operation. BEGIN and END:
+# where the operations begin and end. MORE_FIRST and the next column: where terms of first arguments begin and end in
+# MORE_COLUMN. MORE_SECOND and the next column: where terms of second arguments begin and end in MORE_COLUMN
 KIND, BEGIN, END, MORE_FIRST, _, MORE_SECOND, _, N_GROUP = range(8)
 
 # indices of the scalars in `memory`. Two Taylor series of q (ORDER + 1, n_q each) and arrays (`array_views`) follow.
@@ -76,8 +76,8 @@ KIND, BEGIN, END, MORE_FIRST, _, MORE_SECOND, _, N_GROUP = range(8)
     NEXT_UNIT,  # unit of time (s) of the series about the end of the last attempt
     ALLOWED_SIZE,  # largest step size that the series about the beginning of the step allows, in units of UNIT
     NEXT_ALLOWED_SIZE,  # largest step size that the series about the end of the last attempt allows, in NEXT_UNIT
-    TRIED,  # 1: the last attempt has computed the series about its end, for the next step if the attempt is accepted
-    PASSED,  # time (s) from the state about which the series is computed to the beginning of the step; 0 if KEEP = 0
+    TRIED,  # 1: the last attempt has computed the series about its end, where the next step may begin; 0: it has not
+    PASSED,  # time (s) from the expansion point of the series to the step; 0 unless steps share the series (KEEP = 1)
     TARGET,  # index (0 or 1) of the stored series that `compute_coefficients` overwrites
     # step sizes are multiplied by this factor (at most 1), so that steps end near the constraints; 0: unknown
     DISTANCE_FACTOR,
@@ -163,7 +163,7 @@ def _fill_arguments(options, sums, groups, g, more, values, out):
 
 @merged
 def _store_sums(options, sums, scale, values, out):
-    """Evaluate expressions (`sums`: ROWS or BALANCE) without constants; store `scale` times their values in `out`."""
+    """Store in `out` the values of the expressions ROWS or BALANCE (`sums`), multiplied by `scale`; omit constants."""
     column, coefficient = _integer_array(options, sums + COLUMN), _float_array(options, sums + COEFFICIENT)
     indices = _integer_array(options, sums + SUM_INDICES)
     for o in range(column.size):
@@ -178,9 +178,9 @@ def _store_sums(options, sums, scale, values, out):
 def start_operations(options, table, values, z, x, y):
     """Begin the Taylor series of a list of operations: store the coefficients of order 0 of their results in z.
 
-    `table`: EARLY or LATE. Further coefficients of z follow from products of two series x and y, which are also begun
-    here. If the operation is a product, x and y are its arguments. PENDING products, whose second factor depends on
-    accelerations that are not known yet, are set to zero.
+    `table`: EARLY (operations on t and q) or LATE (on t, q and v). Coefficients of higher orders follow from products
+    of two series x and y, which are begun here, too; if the operation is a product, x and y are its arguments. PENDING
+    products are set to zero: their second factor depends on accelerations that are not known yet.
     """
     groups = _integer_array(options, table + GROUPS)
     constant, constant_2 = (
@@ -219,10 +219,10 @@ def start_operations(options, table, values, z, x, y):
 
 @merged
 def _next_coefficients(options, table, K, values, z, x, y, x0, y0, total):
-    """Store the Taylor coefficients of order K > 0 of a list of operations: of the results z, and of x and y.
+    """Store the Taylor coefficients of order K > 0 of the results z of operations, and of their series x and y.
 
     `table`, x, y: see `start_operations`. x0, y0: coefficients of order 0. `total`: result of `sum_of_products` for
-    order K. In PENDING products, the term with coefficient K of the second factor, not known yet, is left out.
+    order K. As coefficient K of the second factor of a PENDING product is not known yet, its term is left out.
     """
     groups = _integer_array(options, table + GROUPS)
     inverse = 1.0 / K
@@ -271,11 +271,11 @@ def _fill_second_factors(options, table, values, y):
 
 @inlined
 def array_views(options, memory, n, n_rows):
-    """Return nine views of `memory` for computing a Taylor series: N, X1, Y1, X2, Y2, total1, total2, r and c.
+    """Return views of the nine arrays in `memory` with which `compute_coefficients` computes a Taylor series.
 
-    Row k of N has the Taylor coefficients of order k of all quantities. X1, Y1: series x and y of the operations EARLY,
-    see `start_operations`; total1: sums of products of their coefficients. X2, Y2, total2: the same for LATE. r (n) and
-    c (n_rows): right-hand sides of the linear system of an order.
+    These are N, X1, Y1, X2, Y2, total1, total2, r and c. Row k of N has the Taylor coefficients of order k of all
+    quantities. X1, Y1: series x and y of the operations EARLY, see `start_operations`. X2, Y2: those of LATE. total1,
+    total2: sums of products of their coefficients. r (n), c (n_rows): right-hand sides of an order's linear system.
     """
     n_nodes, early, late = int(options[N_NODES]), int(options[EARLY_WIDTH]), int(options[LATE_WIDTH])
     order = int(options[ORDER])
@@ -300,7 +300,7 @@ def array_views(options, memory, n, n_rows):
 
 @merged
 def start_series(options, t, unit, state, N, series, begin_early, x, y, r, c):
-    """Begin the Taylor series of a motion at t and `state`: store the coefficients that need no accelerations in N.
+    """Begin the Taylor series of a motion at t and `state`: store in N the coefficients that need no accelerations.
 
     These are orders 0 and 1 of t and q, order 0 of v, and order 0 of the operations EARLY (series x and y, results in
     N from column `begin_early`). `unit`: unit of time (s). Also set the right-hand sides r and c to zero.
@@ -395,7 +395,7 @@ MAX_DEFECT = 1e300  # replaces an infinite defect: a callback had no finite valu
 MIN_FACTOR = 0.1  # smallest ratio of the next step size to the size of a step rejected because of its defect
 MAX_GROWTH = 5.0  # largest ratio of successive step sizes, because coefficients are scaled by the previous step size
 MAX_FIRST_FACTOR = 1e6  # largest ratio of the first step size to its guess, so that powers of the ratio do not overflow
-TOO_SHORT = 2.0  # returned as error (> 1: rejected) of a first step much shorter than its series allows: repeat it
+TOO_SHORT = 2.0  # the error of a first step much shorter than its series allows: above 1, so that the step is repeated
 
 
 @merged
@@ -519,7 +519,7 @@ def _factor_after_large_defect(defect, order):
 
 @kernel(COMMIT)
 def commit_taylor(f, w, options, memory, tolerances, accepted):
-    """After an accepted step, use the series about its end for the next step; after a rejected one, keep the series."""
+    """If the step was accepted, make the series about its end the current series; if not, discard that series."""
     if accepted and memory[TRIED] == 1.0:
         memory[CURRENT] = 1.0 - memory[CURRENT]
         memory[UNIT], memory[ALLOWED_SIZE] = memory[NEXT_UNIT], memory[NEXT_ALLOWED_SIZE]
@@ -554,7 +554,7 @@ def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
             return Attempt(DONE, error, 1.0 / error)
         error = min(error, 1.0)
         was_near_singular = w.nearly_singular != 0.0  # True if the run is, or has been, near a singular position
-        # near a singular position, check no defect: the series is off the constraints, where accelerations are wrong
+        # near a singular position, check no defect: small violations of constraints by the series spoil accelerations
         checks_defect = w.near_now == 0.0
         w.near_now = 0.0 if checks_defect else 2.0
         ratio_to_gap = gap_ratio(tolerances, h)

@@ -5,8 +5,8 @@ duration of e. J is the Jacobian of the equations of motion (q, v)' = (v, F), wh
 due to a force that jumps within a step lasts long and counts, and an error of fast vibrations hardly counts. There are
 two exceptions:
 
-- The duration belongs to the fastest component of e. If a stiff damper acts beside a contact, the component in slow
-  directions lasts much longer. A filter with the time constant of several steps leaves only this component.
+- The duration is that of the fastest component of e. If a contact and a stiff damper act at the same time, the slow
+  component lasts much longer. A filter with the time constant of several steps removes all other components.
 - If J was computed by finite differences before a contact began or ended, the duration is wrong, although Newton's
   method still converges. `derivatives_agree` detects this. (`w`: workspace, `f`: kit)
 """
@@ -24,7 +24,7 @@ from twoloop.kernels.steps.stages import INNER_TOL, block, vector
 # a velocity error that changes as slowly as the motion is not due to a vibration. Such an error keeps its sign in later
 # steps, so that position errors add up. To allow for this, the error's duration is multiplied by up to this factor
 SLOW_FACTOR = 10.0
-LONGEST_GAPS = 10.0  # velocity errors last at most this many times the longest allowed time between evaluations
+LONGEST_GAPS = 10.0  # largest assumed duration of velocity errors / longest allowed time between evaluations
 STEPS_TO_DECAY = 10.0  # number of steps after which fast components of a velocity error count as decayed
 FAST_DURATION = 20.0  # the duration of a velocity error is short if below this * z (step size * method's coefficient)
 OUTDATED_CHANGE = 0.3  # the Jacobian J of the equations of motion is outdated if its relative change exceeds this
@@ -76,7 +76,7 @@ def velocity_error(w, tolerances, e_v, duration, state, new_state):
 
 @compiled
 def motion_time(w, tolerances, state, a):
-    """Return the time (s) in which velocities change: max|v_i| / max|a_i|, limited as LONGEST_GAPS describes."""
+    """Return the time (s) in which velocities change: max|v_i| / max|a_i|, at most LONGEST_GAPS * tolerances[GAP]."""
     n = w.Q.size
     largest_v = largest_a = 0.0
     for j in w.independent:
@@ -107,10 +107,10 @@ def _derivatives_may_matter(w, memory, tolerances, z, unfiltered, max_duration, 
 def derivatives_agree(f, w, options, memory, s, t, z, tolerances, unfiltered, e_q, e_v, state, new_state, a_end):
     """Return True if the stored Jacobian J still holds at the end of a step, or if its errors are harmless.
 
-    The test compares J (e_q, e_v) with the change of the accelerations when the end is displaced along (e_q, e_v).
-    These vectors are the filtered error estimate, (e_q, e_v) = (I - z J)^-1 u, where the estimate u has the velocity
-    part `unfiltered` (n_dof): so the acceleration part of J (e_q, e_v) is (e_v - unfiltered) / z. t, a_end: time and
-    accelerations at the end. z: step size times a coefficient of the method.
+    The test displaces the end along (e_q, e_v), and compares the change of the accelerations with that predicted by J.
+    Here (e_q, e_v) = (I - z J)^-1 u is the filtered error estimate. The velocity part of the estimate u is `unfiltered`
+    (n_dof), so that J predicts the change (e_v - unfiltered) / z. t, a_end: time and accelerations at the end of the
+    step. z: step size times a coefficient of the method.
     """
     n = w.Q.size
     max_duration = max(motion_time(w, tolerances, state, state[2 * n :]), motion_time(w, tolerances, state, a_end))
