@@ -409,27 +409,37 @@ TINY = 1e-300  # smallest result of `smallest_size`, which avoids divisions by z
 
 
 @merged
-def smallest_size(tolerances):
+def smallest_size(rtol, atol):
     """Return the size that smaller coordinates and velocities count as: the smallest atol / rtol, at most 1."""
     size = 1.0
-    if tolerances[RTOL] > 0.0:
-        for k in range(ATOL, tolerances.size):
-            size = min(size, tolerances[k] / tolerances[RTOL])
+    if rtol > 0.0:
+        for each in atol:
+            size = min(size, each / rtol)
     return max(size, TINY)
 
 
 @merged
+def limited_size(largest, least):
+    """Return `largest`, a norm, if it is between `least` (see `smallest_size`) and 1; else the nearer of both.
+
+    If both norm and `least` are 0, the result is 1.
+    """
+    size = min(max(least, largest), 1.0)
+    return size if size > TINY else 1.0
+
+
+@merged
 def typical_size(tolerances, x):
-    """Return the typical size of x (q or v): max|x_k|, at least `smallest_size`, at most 1; or 1 if x and atol are 0.
+    """Return the typical size of x (q or v): max|x_k|, see `limited_size`.
 
     Smaller components count as this size. If it were 1 for a mechanism of 1e-9 m, finite differences would displace q
     by 1e-7 m, and a correction of 1e-14 m would count as rounding. As x may be rounding errors, such as velocities at
     rest, the size is at least `smallest_size`, where the absolute tolerance begins to count.
     """
-    size = smallest_size(tolerances)
-    for k in range(x.size):
-        size = min(max(size, abs(x[k])), 1.0)
-    return size if size > TINY else 1.0
+    largest = 0.0
+    for each in x:
+        largest = max(largest, abs(each))
+    return limited_size(largest, smallest_size(tolerances[RTOL], tolerances[ATOL:]))
 
 
 @merged
