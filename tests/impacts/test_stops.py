@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from tests.marks import slow
 from tests.problems import unconstrained
-from twoloop import ConstrainedSystem, Status, Stop, load, solve_with_stops
+from twoloop import ConstrainedSystem, ConstraintWarning, Status, Stop, load, solve_with_stops
 from twoloop.bodies import PlanarModel, SpatialModel
 from twoloop.impacts.friction import Tangents, Undetermined, coulomb_forces, impulses
 
@@ -289,6 +289,21 @@ def test_an_impact_on_a_chain_in_space_keeps_its_joints(rotation):
     hit = result.impacts[0]
     q = result.sol(hit.t).q
     assert np.abs(problem.system.velocity_constraint(hit.t, q, hit.v_after)).max() < 1e-9
+
+
+def test_a_linkage_with_a_redundant_row_comes_to_rest_at_a_stop():
+    model = PlanarModel(gravity=(0.0, 0.0))
+    model.rod("bar", (0.6, 0.8), (2.6, 0.8), mass=2.0)
+    for k in range(3):
+        model.rod(str(k), (k, 0.0), (k + 0.6, 0.8), mass=1.0, angular_velocity=-1.0)
+        model.revolute("ground", str(k), at=(k, 0.0))
+        model.revolute(str(k), "bar", at=(k + 0.6, 0.8))
+    model.stop("bar", (2.6, 0.8), "ground", (2.75, 0.0), normal=(-1.0, 0.0), restitution=0.0)
+    with pytest.warns(ConstraintWarning, match="depend on the others"):
+        p = model.problem((0.0, 0.8))
+        result = solve_with_stops(p.system, p.t_span, p.q0, p.v0, p.stops)
+    assert result.success and len(result.impacts) == 1, result.message
+    assert np.abs(result.v[:, -1]).max() < 1e-9
 
 
 EQUAL, UNEQUAL = ([1.0] * 4, [1.0] * 3), ([1.0, 2.0, 1.5, 0.5], [0.3, 0.8, 0.2])  # masses and restitutions

@@ -21,6 +21,7 @@ from twoloop.run.singular_positions import DISPLACEMENT, scaled_to_unit_masses
 
 Array = NDArray[np.float64]
 
+MAX_VIOLATION = 1e-3  # velocities v are rounding errors of rest if max|C_q v| is at least this times |C_q| max|v|
 CHANGE_PER_SAMPLE = 3e-3  # finite differences in time use samples between which C_q changes by about this fraction
 # weights of five equidistant samples in finite differences; row 0: first derivative, row 1: second derivative
 WEIGHTS = np.array([[1.0, -8.0, 0.0, 8.0, -1.0], [-1.0, 16.0, -30.0, 16.0, -1.0]]) / 12.0
@@ -73,10 +74,17 @@ def branch_at(system: ConstrainedSystem, t: float, state: Array, rank: int, allo
 def _branch_at(system: ConstrainedSystem, t: float, state: Array, rank: int, allowed: Array) -> Branch | bool | None:
     """Return what `branch_at` returns; do not catch exceptions of callbacks."""
     q, v, a = np.split(state[: 3 * system.n_q], 3)
-    direction = v if v.any() else a
-    if not direction.any():
-        return None
     mass, rows, divisors, units = scaled_to_unit_masses(system, t, q)
+    norm = float(np.linalg.norm(rows))
+
+    def is_rounding_error(x: Array) -> bool:
+        return bool(np.abs(rows @ (x / units)).max() >= MAX_VIOLATION * norm * np.abs(x / units).max())
+
+    if is_rounding_error(v):  # the mechanism is at rest
+        v = np.zeros(system.n_q)
+    direction = v if v.any() else a
+    if is_rounding_error(direction):
+        return None
     left, _, right = np.linalg.svd(rows)
     lost, free = left[:, rank:].T, right[rank:].T  # lost: rows u^T with u^T C_q = 0; free: columns x with C_q x = 0
 
@@ -88,7 +96,6 @@ def _branch_at(system: ConstrainedSystem, t: float, state: Array, rank: int, all
         samples = [system.velocity_constraint(t, q + s * v, v) for s in step * np.arange(-2.0, 3.0)]
         return WEIGHTS[order - 1] @ samples / (step**order * divisors)  # type: ignore[no-any-return]
 
-    norm = float(np.linalg.norm(rows))
     step = DISPLACEMENT * max(np.abs(q).max(), DISPLACEMENT) / np.abs(direction).max()
     speed = float(np.linalg.norm(derivative_of_rows(direction, step))) / norm  # |dC_q/dt| / |C_q|, 1/s
     if not step * speed > MAX_DIFFERENCE_ERROR * DISPLACEMENT:
