@@ -122,7 +122,7 @@ class ParameterTape(SymbolicObject):
     def product_evaluator(self, parameters: Array) -> Callable[[Powers], Any]:
         """Return a function that evaluates Powers (products of powers of atoms: parameters, sums and functions).
 
-        For `parameters` of shape (n_p,) it returns a number, for (n_runs, n_p) an array (n_runs,); but 1.0 for ().
+        For `parameters` (n_p,) it returns a number, for (n_runs, n_p) an array (n_runs,). Empty Powers always give 1.0.
         """
         atoms: dict[int, Any] = {}
         products: dict[Powers, Any] = {(): 1.0}

@@ -107,7 +107,7 @@ class Interrupts:
         """
         if self.handlers is None and raised_by_handler(error):
             return False
-        self.install_handlers()  # if a signal arrives during this call, it may raise an exception
+        self.install_handlers()  # a signal that arrives during this call may raise an exception
         return self._is_installed and self.n_signals <= MAX_STORED_SIGNALS
 
     def restore_handlers(self) -> None:
@@ -149,8 +149,8 @@ CHUNK_TO_EVENT = 16  # attempted steps in a chunk if an event may end the run, b
 CHUNK_TIME = 0.05
 # statuses whose message may say that stability limited the steps
 STATUSES_WITH_STIFFNESS_NOTE = {Status.REACHED_END, Status.EVENT, Status.MAX_STEPS, Status.TIME_LIMIT, Status.STAGNATED}
-# the polynomial across a singular position may begin at one of the last N_RECENT states, or at the end of one of the
-# N_RECENT last long steps (at least COLLAPSED_STEP * clock[H_LONG]) before these, within the last N_LAST_STATES states
+# states at which the polynomial across a singular position may begin: the last N_RECENT states and, before these, the
+# last N_RECENT ends of long steps (at least COLLAPSED_STEP * clock[H_LONG]), all among the last N_LAST_STATES states
 N_RECENT, N_LAST_STATES = 16, 256
 CROSSING_OVERSHOOT = 100.0  # a crossing step may end beyond t1 by at most this multiple of the run's duration
 NO_KINDS = np.zeros(0, dtype=np.int64)  # kinds of intervals if no states between steps are requested
@@ -202,7 +202,7 @@ class IntegrationLoop:
         self.plan, self.control, self.kit = run.plan, run.control, run.kit  # replaced while steps cross a singularity
         self.counts = INITIAL_COUNTS.copy()
         self.latest_chunks: list[tuple[Array, Array]] = []  # times and rows of the last chunks, see _last_states
-        self.step_parts = [np.empty((0, run.a.N_STEP_COLUMNS))]  # an empty array, then rows of steps not stored yet
+        self.step_parts = [np.empty((0, run.a.N_STEP_COLUMNS))]  # an empty array, then steps not yet in `request.store`
         if self.request.store.append_only:
             self._store_step_fields()
         self.n_filled = np.zeros(2, dtype=np.int64)
@@ -336,7 +336,7 @@ class IntegrationLoop:
                 self.latest_chunks.pop(0)
 
     def _store_step_fields(self) -> None:
-        """Move data of steps from `self.step_parts` to the store: one array for each name in STEP_ARRAYS."""
+        """Move data of steps from `self.step_parts` to `self.request.store`, one array for each name in STEP_ARRAYS."""
         steps, self.step_parts = np.concatenate(self.step_parts), self.step_parts[:1]
         for name, values in step_fields(steps, self.counts).items():
             self.request.store.add(name, values)
@@ -485,7 +485,7 @@ class IntegrationLoop:
         return [(float(t[-2]), table[-2])] if has_velocity_jump_at_end(t, table, run.system.n_q) else []
 
     def _suspicious_outputs(self, t: Array, table: Array) -> list[TimedState]:
-        """Return all output states, to be checked, if a step ended at one of them near a singular position, else []."""
+        """If an output state at the end of a step is near a singular position, return all output states, else []."""
         run, request = self.run, self.request
         equal_steps = run.control[run.a.FIXED_STEP] > 0.0 and request.times is None
         if not run.passed_near_singular() or not (
@@ -495,7 +495,7 @@ class IntegrationLoop:
         return list(zip(t.tolist(), table, strict=True))
 
     def _next_buffers(self) -> Buffers:
-        """Return buffers for the times, states and steps of a chunk; attempted steps fill at most one row of each."""
+        """Return buffers for the times, states and steps of a chunk; an attempt fills at most one row of each."""
         chunk, width = self.run.chunk, len(self.run.state)
         n_rows, n_steps = max(min(chunk, BUFFER_ROWS), LANES), max(min(chunk, BUFFER_STEPS), LANES)
         spare_buffers = _spare_buffers.pop((n_rows, n_rows * width, n_steps), None)

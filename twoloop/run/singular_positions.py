@@ -37,8 +37,8 @@ JUMP_RATIO, MIN_JUMP = 3.0, 10.0
 def describe_crossings(system: ConstrainedSystem, crossings: Crossings, end_state: TimedState, rank: int) -> str:
     """Return sentences about the singular positions that steps crossed, for the message of a result.
 
-    `crossings`: for each position, the states before and after it; if a run ended within a crossing, its last state
-    `end_state` replaces the missing state after it. `rank`: rank of the constraint Jacobian at other positions.
+    `crossings`: for each singular position, the states before and after it. If the run ended within the crossing, its
+    last state, `end_state`, counts as the state after it. `rank`: rank of the Jacobian far from singular positions.
     """
     ratios = {
         ends[0][0]: _least_ratio_between(system, ends[0], [*ends, end_state][1], rank) for ends in crossings[:MAX_SHOWN]
@@ -139,7 +139,7 @@ def has_velocity_jump_at_end(times: Array, rows: Array, n: int) -> bool:
 
 
 def _crossing_ends(crossings: Crossings, end_state: TimedState) -> Iterator[tuple[TimedState, TimedState, bool]]:
-    """Yield, for each position, the states before and after it, and whether a crossing was completed in between."""
+    """Yield, for each singular position, the states before and after it, and whether the crossing was completed."""
     before: TimedState | None = None
     for first, *after in crossings:
         before = first if before is None else before
@@ -225,7 +225,7 @@ def velocity_rounding_errors(system: ConstrainedSystem, t: float, q: Array, v: A
             row_slopes = np.abs(np.subtract(*(system.rows(t, each) for each in displaced)))
         except (ArithmeticError, ValueError):  # a square root, for example, fails beyond a dead centre
             return np.full(len(q), np.nan)
-        # rounding errors of constraints are those of q times Jacobian entries nearby, because entries at q may be small
+        # errors of constraints due to rounding of q, with Jacobian entries near q, since those at q itself may be small
         nearby_rows = np.abs(rows) + (row_slopes * (np.abs(rows).max() / row_slopes.max()) if row_slopes.any() else 0.0)
         rounding = ROUNDING * np.sqrt((nearby_rows * nearby_rows) @ (q * q))
         errors = np.maximum(

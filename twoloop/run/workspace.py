@@ -56,7 +56,7 @@ def newton_form(
     bodies: list[tuple[int, ...]],
     stiff: list[int],
 ) -> tuple[NDArray[np.int32], int] | None:
-    """Return the program (list of operations) that factorizes Newton's sparse matrix, and the number of column groups.
+    """Return the program to factorize Newton's sparse matrix, and the number of groups of columns computed together.
 
     Columns of a group have no nonzero entries in the same row: so one finite difference of forces yields all of them.
     `mass`, `jacobian`: indices of nonzero entries of M and C_q. `bodies`: coordinates of each body. `stiff`: result of
@@ -139,7 +139,7 @@ class FixedOrderForm(NamedTuple):
         return self.n_groups + float(self.newton_program[N_UPDATES]) / max(1.0, float(self.program[N_UPDATES]))
 
     def newton_matrices_size(self, matrices: int) -> int:
-        """Return the length of the array of sparse matrices that replaces a plan's `matrices` dense ones (n_q, n_q)."""
+        """Return the length of the array of a plan's sparse matrices; `matrices`: number of dense ones they replace."""
         from twoloop.kernels.steps.newton_systems import matrices_size
         from twoloop.kernels.steps.stages import SYSTEMS
 
@@ -202,9 +202,9 @@ def _create_fixed_order_form(system: ConstrainedSystem, t0: float, q0: Array) ->
 
 
 def _coordinates_of_bodies(system: ConstrainedSystem, mass: Entries) -> list[tuple[int, ...]]:
-    """Return for each known body the tuple of its coordinates (indices).
+    """Return the indices of each body's coordinates; a body that no joint names may be missing.
 
-    The joints of the system name one body each, so that bodies at the ends of chains may be missing. If all bodies have
+    Each joint of the system names one body, so that bodies at the ends of chains may be missing. If all bodies have
     seven coordinates (position and Euler parameters), no body is missing.
     """
     coordinates_by_joint = [joint.translation + joint.rotation for joint in system.joints]
@@ -380,7 +380,7 @@ def kit_for_plan(system: ConstrainedSystem, flags: Array, plan: Plan | None) -> 
 
 
 def _steps_of_plan(plan: Plan) -> tuple[Any, Any, Any]:
-    """Return a plan's Step and both Steps of its pair; None without a pair, PLACEHOLDER_STEP if not imported yet."""
+    """Return a plan's Step, and both Steps of its pair (None: it has no pair; PLACEHOLDER_STEP: not imported yet)."""
     return load_step(plan.step), load_step(plan.first), step_if_loaded(plan.second)
 
 

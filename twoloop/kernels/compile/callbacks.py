@@ -148,7 +148,7 @@ class CallbackKind:
 
     @property
     def optional(self) -> bool:
-        """Return True if a system may lack this callback, unless `needed_by` requires it."""
+        """Return False if all systems must have this callback; True if none must, or only some (see `needed_by`)."""
         return self.absent != ""
 
     @cached_property

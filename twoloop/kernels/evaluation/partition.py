@@ -153,7 +153,7 @@ def _find_pivot_order(w, max_rank, max_rank_v):
     w.pivot = abs(G[rank - 1, rank - 1]) if rank > 0 else 1.0
     if n_rows == n_c:
         return rank, rank
-    last = rank  # pivots are chosen in the first `last` rows: the loop puts rows of A after the independent rows
+    last = rank  # pivots are chosen in rows before `last`: the loop puts rows of A after the independent rows of C_q
     for i in range(n_c, n_rows):
         row_order[last], row_order[i] = row_order[i], row_order[last]
         for j in range(G.shape[1]):
@@ -224,7 +224,7 @@ def write_programs(w):
 
 @compiled
 def _record_columns_of_entries(w):
-    """Store the columns of ones in row i of w.pattern as w.row_entries[w.row_entries[i] : w.row_entries[i + 1]]."""
+    """Store in w.row_entries[w.row_entries[i] : w.row_entries[i + 1]] the columns in which row i of w.pattern is 1."""
     n_rows = w.Rate.size
     index = n_rows + 1
     for i in range(n_rows):
@@ -342,11 +342,11 @@ def _largest_coefficient(w):
 
 @compiled
 def partition_is_poor(w):
-    """Return True if the dependent coordinates have become so sensitive that a new partition is needed.
+    """Return True if the dependent coordinates are so sensitive to the independent ones that a new partition is needed.
 
-    The sensitivity to the independent coordinates is max|C_qd^-1 C_qi| (w.D); C_qd and C_qi are the columns of the
-    dependent and the independent coordinates in C_q. The sensitivity is near 1 after full pivoting, and grows without
-    bound where the independent coordinates stop being valid. Also return True if the independent rows become dependent
+    The sensitivity is max|C_qd^-1 C_qi| (w.D); C_qd and C_qi are the columns of the dependent and the independent
+    coordinates in C_q. It is near 1 after full pivoting, and grows without bound where the independent coordinates no
+    longer determine the dependent ones. Also return True if the independent rows become dependent
     while the rank stays the same: redundant rows then have large coefficients as combinations of independent rows.
     """
     largest = 0.0

@@ -219,10 +219,10 @@ def start_operations(options, table, values, z, x, y):
 
 @merged
 def _next_coefficients(options, table, K, values, z, x, y, x0, y0, total):
-    """Store the Taylor coefficients of order K > 0 of the results z of operations, and of their series x and y.
+    """Store the Taylor coefficients of order K > 0 of operations: of their results z and two auxiliary series x and y.
 
-    `table`, x, y: see `start_operations`. x0, y0: coefficients of order 0. `total`: result of `sum_of_products` for
-    order K. As coefficient K of the second factor of a PENDING product is not known yet, its term is left out.
+    `table`, x, y: see `start_operations`. x0, y0: order 0 of x and y. `total`: result of `sum_of_products` for order K.
+    In a PENDING product, the term with coefficient K of the second factor, which is not known yet, is left out.
     """
     groups = _integer_array(options, table + GROUPS)
     inverse = 1.0 / K
@@ -300,10 +300,10 @@ def array_views(options, memory, n, n_rows):
 
 @merged
 def start_series(options, t, unit, state, N, series, begin_early, x, y, r, c):
-    """Begin the Taylor series of a motion at t and `state`: store in N the coefficients that need no accelerations.
+    """Begin the series of a motion at t and `state`: store in the matrix N the coefficients that need no accelerations.
 
-    These are orders 0 and 1 of t and q, order 0 of v, and order 0 of the operations EARLY (series x and y, results in
-    N from column `begin_early`). `unit`: unit of time (s). Also set the right-hand sides r and c to zero.
+    These are orders 0 and 1 of t and q, and order 0 of v and of the operations EARLY. Results of EARLY begin at column
+    `begin_early` of N. x, y: see `start_operations`. `unit`: unit of time (s). Set the right-hand sides r, c to zero.
     """
     n = r.size
     r[:], c[:] = 0.0, 0.0
@@ -389,18 +389,18 @@ TARGET_PREDICTION_ERROR = 0.3
 MAX_NOISE, NOISE_RATIO = 1e4, 10.0
 NEAR_BEGIN = 1e-5  # time from the beginning of a step to a state where the series is exact, relative to the step size
 # the defect is checked at equidistant times within a step. At each attempt, these times shift by this fraction of their
-# spacing. Multiples of the golden section have evenly distributed fractional parts: so no time is missed for long
+# spacing. Multiples of the golden section have evenly distributed fractional parts: many attempts cover a step evenly
 GOLDEN_SECTION = 0.6180339887498949
-MAX_DEFECT = 1e300  # replaces an infinite defect: a callback had no finite value within the step, which is rejected
+MAX_DEFECT = 1e300  # replaces an infinite defect, which means that a callback had no finite value: the step is rejected
 MIN_FACTOR = 0.1  # smallest ratio of the next step size to the size of a step rejected because of its defect
 MAX_GROWTH = 5.0  # largest ratio of successive step sizes, because coefficients are scaled by the previous step size
 MAX_FIRST_FACTOR = 1e6  # largest ratio of the first step size to its guess, so that powers of the ratio do not overflow
-TOO_SHORT = 2.0  # the error of a first step much shorter than its series allows: above 1, so that the step is repeated
+TOO_SHORT = 2.0  # error returned for a first step much shorter than its series allows; above 1, so that it is repeated
 
 
 @merged
 def _compute_series(f, w, options, memory, t, state, unit, index):
-    """Compute the Taylor series about `state`, which was projected last; store it as series `index` (0 or 1)."""
+    """Compute the Taylor series about `state`, the state projected last; store it as series `index` (0 or 1)."""
     n = w.Q.size
     memory[TARGET] = index
     if f.is_generated == 1 and w.used_general == 0.0:  # generated code has stored no factors in w: compute the factors
@@ -413,7 +413,7 @@ def _compute_series(f, w, options, memory, t, state, unit, index):
 
 @merged
 def _max_step(tolerances, series, unit, order, n):
-    """Return the largest step size, in units of `unit` (s), with the last two terms of `series` within tolerances."""
+    """Return the largest step size, divided by `unit` (s), that keeps the last two terms of `series` in tolerances."""
     rtol, last, before = tolerances[RTOL], 0.0, 0.0
     row, row_before = order * n, (order - 1) * n
     for j in range(n):
