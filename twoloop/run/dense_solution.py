@@ -489,7 +489,7 @@ class DenseState:
         Times, s.
     q, v : ndarray (n_q,) or (n_q, n)
         Coordinates and velocities, satisfying the constraints to rounding error. Exception: close to a singular
-        position, where rounding would dominate the velocities, they are not projected, and a warning says so.
+        position, rounding would dominate projected velocities: q and v are not projected, and a warning says so.
     a : ndarray (n_q,) or (n_q, n)
         Accelerations at these times, evaluated when they are first read.
     lam : ndarray (n_c + n_a,) or (n_c + n_a, n)

@@ -197,7 +197,7 @@ class IntegrationLoop:
         has_terminal_event = request.events is not None and any(event.terminal < np.inf for event in request.events)
         if has_terminal_event:
             self.largest_chunk = run.chunk = CHUNK_TO_EVENT
-        # progress is checked every `check_interval` attempted steps, next after `next_check` attempted steps in the run
+        # progress is checked every `check_interval` attempted steps; next when the run has attempted `next_check` steps
         self.check_interval = self.next_check = run.chunk
         self.plan, self.control, self.kit = run.plan, run.control, run.kit  # replaced while steps cross a singularity
         self.counts = INITIAL_COUNTS.copy()

@@ -257,7 +257,7 @@ def _stiff_rows(
 
 
 def _massless_directions(block: Array) -> Array:
-    """Return the massless directions of a body, as rows, given its `block` of M; if this is not finite, return all."""
+    """Return the massless directions of a body, as rows, given its `block` of M; all directions if `block` is not finite."""
     if not np.isfinite(block).all():
         return np.eye(len(block))
     values, directions = np.linalg.eigh(block)

@@ -169,7 +169,7 @@ CHECKSUM_SIZE = hashlib.sha256().digest_size  # length (bytes) of the checksum a
 
 
 class CodeFiles:
-    """Store the machine code of a function on disk, in one file with a checksum for each key, such as a signature.
+    """Store the machine code of a function on disk: for each key, such as a signature, one file with a checksum.
 
     Only the user can write these files. A file counts as missing if it is damaged or out of date: written with another
     `stamp` or version of numba. There is no index file like numba's, which several processes may damage.

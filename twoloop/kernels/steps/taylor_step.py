@@ -146,7 +146,7 @@ def sum_of_products(X, Y, K, total):
 
 @merged
 def _fill_arguments(options, sums, groups, g, more, values, out):
-    """Compute the first (or second) argument of each operation of a group; store the arguments in `out`.
+    """Compute the first or the second arguments of all operations of a group; store these arguments in `out`.
 
     Arguments are affine expressions in `values`, the Taylor coefficients of one order of all quantities; constants are
     left out, as they belong to order 0. `sums`: index of the arrays of the expressions. `g`: index at which the group's
@@ -385,7 +385,7 @@ def compute_coefficients(f, w, options, memory, t, state, unit):
 # aim of the step sizes: (distance of the end of a step from the constraints, before projection) / (allowed distance)
 TARGET_PREDICTION_ERROR = 0.3
 # the defect at NEAR_BEGIN, near the beginning of a step, is due to rounding, because the series is exact there. A later
-# defect counts as rounding error if it is at most NOISE_RATIO times this, and at most MAX_NOISE * (allowed defect)
+# defect counts as rounding error if it is at most NOISE_RATIO times that, and at most MAX_NOISE * (allowed defect)
 MAX_NOISE, NOISE_RATIO = 1e4, 10.0
 NEAR_BEGIN = 1e-5  # time from the beginning of a step to a state where the series is exact, relative to the step size
 # the defect is checked at equidistant times within a step. At each attempt, these times shift by this fraction of their
