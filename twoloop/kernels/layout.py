@@ -97,7 +97,7 @@ def _allocate_workspace(sizes: Sizes) -> Work:
 
 
 def keep_unused_workspace(work: Work) -> None:
-    """Keep a workspace for later runs unless it is large. Beyond MAX_UNUSED, discard workspaces used longest ago."""
+    """Keep a small workspace for later runs. If more than MAX_UNUSED are kept, discard those used longest ago."""
     unused = _unused_workspaces.pop(work.sizes, [])
     if work.notes.base.size <= MAX_UNUSED_SIZE and len(unused) < MAX_UNUSED:
         unused.append(work)

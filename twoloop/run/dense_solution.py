@@ -300,7 +300,7 @@ class Interpolator:
         n, options = self.system.n_q, crossing_plan(self.system.n_q).options
         times = np.linspace(table.t[i], table.t[i + 1], self.parts + 1)
         states = np.array([state_at(memory, options, t) for t in times])
-        # at both ends of the interval, use q and v of the table, but not its accelerations: these may have large errors
+        # at both ends of the interval, use q and v of the table, but not a, which may have large rounding errors
         states[[0, -1], : 2 * n] = table.states[i : i + 2, : 2 * n]
         return times, states
 

@@ -225,7 +225,7 @@ def velocity_rounding_errors(system: ConstrainedSystem, t: float, q: Array, v: A
             row_slopes = np.abs(np.subtract(*(system.rows(t, each) for each in displaced)))
         except (ArithmeticError, ValueError):  # a square root, for example, fails beyond a dead centre
             return np.full(len(q), np.nan)
-        # errors of constraints due to rounding of q, with Jacobian entries near q, since those at q itself may be small
+        # estimate errors of C due to rounding of q with Jacobian entries near q: entries at q itself may be small
         nearby_rows = np.abs(rows) + (row_slopes * (np.abs(rows).max() / row_slopes.max()) if row_slopes.any() else 0.0)
         rounding = ROUNDING * np.sqrt((nearby_rows * nearby_rows) @ (q * q))
         errors = np.maximum(

@@ -202,9 +202,9 @@ def _create_fixed_order_form(system: ConstrainedSystem, t0: float, q0: Array) ->
 
 
 def _coordinates_of_bodies(system: ConstrainedSystem, mass: Entries) -> list[tuple[int, ...]]:
-    """Return the indices of each body's coordinates; a body that no joint names may be missing.
+    """Return the indices of each body's coordinates; a body may be missing if no joint refers to it.
 
-    Each joint of the system names one body, so that bodies at the ends of chains may be missing. If all bodies have
+    Each joint of the system refers to one body: so bodies at the ends of chains may be missing. If all bodies have
     seven coordinates (position and Euler parameters), no body is missing.
     """
     coordinates_by_joint = [joint.translation + joint.rotation for joint in system.joints]
@@ -257,7 +257,7 @@ def _stiff_rows(
 
 
 def _massless_directions(block: Array) -> Array:
-    """Return the massless directions of a body, as rows, given its `block` of M; all directions if `block` is not finite."""
+    """Return a body's massless directions, as rows, given its `block` of M; all directions if `block` is not finite."""
     if not np.isfinite(block).all():
         return np.eye(len(block))
     values, directions = np.linalg.eigh(block)

@@ -28,7 +28,7 @@ CONTINUE = -1  # value that functions return in place of an end code if the loop
 
 # indices of the N_RULE parameters of step-size control. The next step size is SAFETY * error**-EXPONENT times the size
 # of this step (`error`: of this step, in tolerances), but FACTOR_MIN times this size at least and FACTOR_MAX times at
-# most. If LEAST_ERROR > 0, the larger of LEAST_ERROR and the previous step's error counts, too (Hairer & Wanner, IV.8)
+# most. If LEAST_ERROR > 0, the larger of LEAST_ERROR and the previous error also counts (Hairer & Wanner II, IV.8)
 SAFETY, EXPONENT, FACTOR_MIN, FACTOR_MAX, LEAST_ERROR, N_RULE = range(6)
 # indices of the N_PAST numbers in the history: size (s) and error (in tolerances) of the last accepted step
 H_BEFORE, ERROR_BEFORE, N_PAST = range(3)

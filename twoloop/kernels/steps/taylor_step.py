@@ -385,7 +385,7 @@ def compute_coefficients(f, w, options, memory, t, state, unit):
 # aim of the step sizes: (distance of the end of a step from the constraints, before projection) / (allowed distance)
 TARGET_PREDICTION_ERROR = 0.3
 # the defect at NEAR_BEGIN, near the beginning of a step, is due to rounding, because the series is exact there. A later
-# defect counts as rounding error if it is at most NOISE_RATIO times that, and at most MAX_NOISE * (allowed defect)
+# defect counts as rounding error if it is at most NOISE_RATIO times the former and MAX_NOISE * (allowed defect)
 MAX_NOISE, NOISE_RATIO = 1e4, 10.0
 NEAR_BEGIN = 1e-5  # time from the beginning of a step to a state where the series is exact, relative to the step size
 # the defect is checked at equidistant times within a step. At each attempt, these times shift by this fraction of their
@@ -413,7 +413,7 @@ def _compute_series(f, w, options, memory, t, state, unit, index):
 
 @merged
 def _max_step(tolerances, series, unit, order, n):
-    """Return the largest step size, divided by `unit` (s), that keeps the last two terms of `series` in tolerances."""
+    """Return the largest ratio of step size to `unit` (s) that keeps the last two terms of `series` within tolerances."""
     rtol, last, before = tolerances[RTOL], 0.0, 0.0
     row, row_before = order * n, (order - 1) * n
     for j in range(n):
