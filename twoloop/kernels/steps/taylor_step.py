@@ -413,7 +413,7 @@ def _compute_series(f, w, options, memory, t, state, unit, index):
 
 @merged
 def _max_step(tolerances, series, unit, order, n):
-    """Return the largest ratio of step size to `unit` (s) that keeps the last two terms of `series` within tolerances."""
+    """Return the largest (step size) / `unit` (s) that keeps the last two terms of `series` within tolerances."""
     rtol, last, before = tolerances[RTOL], 0.0, 0.0
     row, row_before = order * n, (order - 1) * n
     for j in range(n):
