@@ -164,7 +164,7 @@ def _find_pivot_order(w, max_rank, max_rank_v):
 
 @compiled
 def smallest_pivot(f, w, t, q):
-    """Return the smallest pivot of C_q at (t, q), rows scaled to maxima 1; 0 if the rank is below the partition's."""
+    """Return the smallest pivot of C_q at (t, q), with rows scaled to maxima of 1; 0 if C_q has lost rank."""
     rank = w.rows.size
     if rank == 0:
         return 1.0
