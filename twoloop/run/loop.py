@@ -323,7 +323,7 @@ class IntegrationLoop:
             notes[indices.TIME_IS_UP] = 0.0
 
     def _store_chunk(self, t: Array, rows: Array, steps: Array, kinds: NDArray[np.int64]) -> None:
-        """Record the states (times, rows) and steps of a chunk, and the kinds of the intervals between its states."""
+        """Record the states (times, rows) and steps of a chunk, and the kinds of the intervals that the steps cover."""
         run = self.run
         self.sample.add(t, rows, float(run.clock[run.a.T]), run.state)
         self.step_parts.append(steps)
