@@ -36,10 +36,10 @@ from twoloop.kernels.compile.generated_functions import generated_functions
 from twoloop.problem.system import ConstrainedSystem
 
 DOUBLE_POINTER = f"{DOUBLE}*"
-# generated code is not used if the relative error of its accelerations near the start exceeds LARGEST_LOSS. This is
-# checked only if PivotChoice has added rows, or refines solutions. During runs, the error grew by a factor of up to 200
+# generated code is not used if the relative error of its accelerations near the start exceeds LARGEST_LOSS. The test is
+# made only if solutions are refined, or terms s g^T g (g: row of G) are added to M. In runs, errors grew up to 200-fold
 LARGEST_LOSS = 1e-8
-MAX_POSITIONS, SPACING = 4, 0.02  # number and spacing (m or rad) of positions that are tried to check LARGEST_LOSS
+MAX_POSITIONS, SPACING = 4, 0.02  # number of positions that `_relative_error` may try, and their spacing (m or rad)
 
 
 def write_accelerations(
@@ -228,7 +228,7 @@ class SplitFunctions:
         return list(functions)
 
     def _call(self, emit: Emitter, *calls: tuple[str, Sequence[Value]]) -> Value:
-        """Write `calls` (function, arguments), and missing functions; return a flag: 1 if all results are valid."""
+        """Write `calls` (function, arguments), and functions not written yet; return a flag: 1 if all succeed."""
         module, all_valid = emit.builder.module, None
         for part, arguments in calls:
             name = f"{part}_{emit.suffix}"
@@ -241,7 +241,7 @@ class SplitFunctions:
         return all_valid
 
     def _lowering(self, emit: Emitter, graph: Graph, args: Sequence[Value], stored: Mapping[int, Location]) -> Lowering:
-        """Return a Lowering, which writes operations; `args` begin with three inputs and a pointer to coefficients."""
+        """Return a Lowering, which writes operations. args[:4]: three inputs of `graph`, pointer to coefficients."""
         *inputs, emit.numbers = args[:4]
         if width_of(emit.double_type) > 1:
             emit.constants = emit.numbers  # type: ignore[attr-defined]  # the coefficients are the same in all lanes
@@ -343,7 +343,7 @@ class SplitFunctions:
         return is_valid
 
     def _stack_arrays(self, emit: Emitter) -> list[Value]:
-        """Return scratch arrays for factors of [M G^T; G 0], right-hand sides r and c, multipliers or a change of v."""
+        """Return four scratch arrays: for factors of [M G^T; G 0], for r, for c, for multipliers or a change of v."""
         sizes = self.solution.n_stored, self.n, self.n_rows, max(self.n, self.n_rows)
         return [_stack_array(emit, size) for size in sizes]
 
@@ -371,7 +371,7 @@ Array = NDArray[np.float64]
 def write_function(
     module: Module, name: str, kind: tuple[str, list[str]], program: Program, numbers: Coefficients
 ) -> None:
-    """Write the LLVM function `name`, which computes the arrays of a program from its inputs.
+    """Write the LLVM function `name`, which runs a program: it computes arrays of results from the program's inputs.
 
     If the program's conditions hold and its first array is finite, the function stores the arrays and returns true;
     else it stores nothing and returns false. `kind`: types of its result and arguments.
@@ -454,7 +454,7 @@ class GeneratedCode(NamedTuple):
         return self.traced.kinds
 
     def is_valid_from(self, system: ConstrainedSystem, t0: float, q0: Array) -> bool:
-        """Return True if a run may start at (t0, q0) with this code: if the same rows and pivots are chosen there."""
+        """Return True if a run may start at (t0, q0) with this code, as the same rows and pivots are chosen there."""
         try:
             return _choice_at(system, t0, q0) == self.shared.equations.choice
         except Untraceable:

@@ -26,7 +26,7 @@ MAX_VELOCITY_ROUNDING = 10.0
 SINGULAR_PIVOT_RATIO = 0.01
 SINGULAR_PIVOT = 1e-5
 # a position is also singular if its pivot ratio r is below WEAK_PIVOT, and r * (change of v by projection, in units of
-# the tolerances) is below MAX_VIOLATION: this product is about the violation removed, perhaps due to rounding only
+# the tolerances) is below MAX_VIOLATION. This product is about the removed violation, so small that it may be rounding
 MAX_VIOLATION, WEAK_PIVOT = 10.0, 0.05
 
 
@@ -36,7 +36,7 @@ def _node_range(low, high, i, last):
 
     The interval is in the middle of these states, unless an index would be below `low` or above `high`.
     """
-    if last > i + 1:  # `fill_intervals` has added states within the interval: interpolate only its own states
+    if last > i + 1:  # `fill_intervals` has added states within the interval: interpolate only states i to `last`
         return i, last
     n_states = min(kinds.WINDOW, high - low + 1)
     lo = max(low, min(i + 1 - n_states // 2, high + 1 - n_states))
@@ -212,7 +212,7 @@ def interpolate_states(f, w, tolerance, tolerances, t, states, groups, times, z,
 
 @merged
 def _state_difference(tolerances, scale_q, scale_v, states, i, q, v, q_other, v_other):
-    """Return the largest scale_q |q - q_other| or scale_v |v - v_other|, in units of the tolerances for state i."""
+    """Return the largest difference of two states, times scale_q for q and scale_v for v, in tolerances of state i."""
     n = q.size
     rtol, largest, total = tolerances[RTOL], 0.0, 0.0
     for m in range(n):
@@ -220,7 +220,7 @@ def _state_difference(tolerances, scale_q, scale_v, states, i, q, v, q_other, v_
         change_q = scale_q * abs(q_other[m] - q[m]) / (atol + rtol * abs(states[i, m]))
         change_v = scale_v * abs(v_other[m] - v[m]) / (atol + rtol * abs(states[i, n + m]))
         largest, total = max(largest, change_q, change_v), total + change_q + change_v
-    # `total` is not finite if two interpolated states have equal times, as after a step no longer than rounding of t
+    # the sum `total` is not finite if two interpolated states have equal times (a step may be as short as rounding)
     return largest if np.isfinite(total) else np.inf
 
 
@@ -256,14 +256,14 @@ def _has_similar_gaps(t, lo, hi):
 def estimate_errors(f, w, tolerance, tolerances, t, states, groups, z, coefficients, rows, out):
     """For each interval g of `groups`, store in out[g] the estimated error of its polynomials, in tolerances.
 
-    There are three estimates (`tolerance`: of the projection; z, coefficients, rows: scratch):
-    - 0, if the kind is SEPARATE or VELOCITIES, and the polynomials interpolate more than two states, which are about
-      equally spaced and not inside the interval
-    - otherwise, with more than two states: the change of the polynomials when the last state is not interpolated. It is
-      used if it is at most 1, or if the kind is VELOCITIES, whose accelerations contain noise of stiff modes
-    - otherwise, the larger of two differences at CHECKED_FRACTIONS: between a state before and after its projection;
-      and between accelerations by the polynomials and by the equations of motion. With dt = h / (number of
-      coefficients), dt times the second difference counts as an error of v, and dt^2 times it as an error of q
+    `tolerance`: tolerance of the projection; z, coefficients, rows: scratch. The first estimate that applies is used:
+    - 0, if the kind is SEPARATE or VELOCITIES, more than two states are interpolated, none of them inside the interval,
+      and the steps between these states are about equally long
+    - the change of the polynomials if the last state is not interpolated. This estimate needs more than two states. It
+      must be at most 1, unless the kind is VELOCITIES, whose accelerations contain noise of stiff modes
+    - the larger of two differences at CHECKED_FRACTIONS. The first one is between a state before and after projection,
+      the second one between accelerations by polynomials and by the equations of motion. With dt = h / (number of
+      coefficients), the second one times dt counts as an error of v, and times dt^2 as an error of q
     """
     n = w.Q.size
     half = z.size // 2

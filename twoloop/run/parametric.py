@@ -94,7 +94,7 @@ class ParametricRun:
         run.kit = kit_for_plan(self.system, run.kit.flags, run.plan)
 
     def use_parameters_of(self, system: ConstrainedSystem) -> bool:
-        """Write the parameters of a system to the arrays; return False if the arrays contained them already."""
+        """Write the parameters of a system to the run's arrays; return False if these arrays contain them already."""
         if system is self.current_system:
             return False
         self._fill_arrays(system)

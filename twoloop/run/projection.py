@@ -320,7 +320,7 @@ def _project_state(
 
 
 class _LargeState(ConsistentState):
-    """Consistent state of a large system; its assembly is computed only when read, as that needs full matrices."""
+    """Consistent state of a large system, whose assembly needs full matrices, and is computed only when it is read."""
 
     system: ConstrainedSystem
     t: float
@@ -382,12 +382,12 @@ def _projected_position(
 def _describe_other_assembly(
     system: ConstrainedSystem, t: float, q1: Array, guess: Array, free: NDArray[np.intp], scales: Scales, cutoff: float
 ) -> str | None:
-    """Check whether guesses as far from the projected position q1 as `guess` may lead to another assembly.
+    """Return a phrase about a guess, as far from q1 as `guess`, that may lead to another assembly; None: there is none.
 
-    Return None if they cannot, or a phrase about one that may. A guess leads to the same assembly if its projection is
-    about the point that C_q predicts to first order, and the determinant of the dependent columns keeps its sign. If
-    not, Newton's method starts from the independent coordinates of q1 and the dependent ones of the projected guess. If
-    this iteration does not lead back to q1, there is another assembly.
+    q1: projection of `guess`. A guess leads to the same assembly if its projection is near the point that C_q predicts
+    to first order, and the determinant of the dependent columns keeps its sign. If not, Newton's method starts from the
+    independent coordinates of q1 and the dependent ones of the projected guess. If this iteration does not lead back
+    to q1, there is another assembly.
     """
     scaled_move = (q1 - guess) / scales.columns
     largest_move = float(np.abs(scaled_move).max())
@@ -411,8 +411,8 @@ def _describe_other_assembly(
         expected = q1 + displacement + _least_change(jacobian, free, -(jacobian @ displacement), cutoff)
         if distance(projected, expected) <= MAX_NONLINEARITY * float(np.abs(move).max()) and sign_at(projected) == sign:
             continue
-        # the prediction may be inaccurate only because constraints are curved. Then `mixed`, q1 with the dependent
-        # coordinates of `projected`, is projected back to q1. Otherwise, `projected` is on another assembly
+        # `projected` is not near the prediction `expected`, perhaps only because constraints are curved. In this case,
+        # `mixed` (q1 with the dependent coordinates of `projected`) is projected to q1, otherwise to another assembly
         mixed = q1.copy()
         mixed[dependent_columns] = projected[dependent_columns]
         mixed_projected, excess, _ = _gauss_newton(system, t, mixed, np.array(dependent_columns, dtype=int), cutoff)

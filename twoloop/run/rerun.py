@@ -136,7 +136,7 @@ def python_functions(system: ConstrainedSystem) -> PythonFunctions | None:
 def first_force(system: ConstrainedSystem, t0: float, q0: Array, v0: Array) -> tuple[Any, Array] | None:
     """Return ((t0, q0, v0), value of the compiled force) for `describe_changed_force`; None if the force fails.
 
-    If callbacks are called in Python, return None: the run records calls of the force. Delete records of earlier runs.
+    If callbacks are called in Python, the run will record calls of the force: discard older records, and return None.
     """
     if functions := python_functions(system):
         functions.restart()
@@ -230,7 +230,7 @@ class IndependentRerun:
         self.next_step = np.inf
 
     def integrate(self, t0: float, state: Array, times: Array, max_attempts: int) -> RerunPiece | None:
-        """Integrate from a state [q, v] at t0 to all `times`; None: failed, or more than about `max_attempts` steps."""
+        """Integrate from [q, v] at t0 to all `times`; return None on failure, or after about `max_attempts` steps."""
         run, a, n = self.run, self.run.a, len(state)
         proposed_step, self.next_step = self.next_step, np.inf
         if run.restart(t0, state[: n // 2], state[n // 2 :]) != indices.DONE:

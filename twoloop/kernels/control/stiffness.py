@@ -53,23 +53,23 @@ from twoloop.kernels.linalg.dense import copy
 # the largest rate is first estimated after FIRST_ESTIMATE evaluations of the equations, later every BETWEEN_ESTIMATES
 # evaluations. While the explicit method is active, both numbers are multiplied by options[COST_RATIO]
 FIRST_ESTIMATE, BETWEEN_ESTIMATES = 100.0, 600.0
-N_POWER_ITERATIONS = 4  # power iterations by dF/dq in an estimate (F: accelerations), and at most this number by dF/dv
+N_POWER_ITERATIONS = 4  # number of power iterations by dF/dq, and largest number of those by dF/dv (F: accelerations)
 NEGLIGIBLE_DAMPING = 1e-3  # power iterations by dF/dv (F: acceleration) end if eigenvalue * step size is below this
 ZERO_REPLACEMENT = 1e-3  # replaces zero components of the vector of a power iteration, whose largest component is 1
-URGENT_RATIO = 3.0  # no cost delays a trial (it is urgent) if step size * (largest rate) / stability limit exceeds this
+URGENT_RATIO = 3.0  # a trial is urgent (cost cannot delay it) if step size * largest rate / stability limit > this
 # if Jacobians are computed by finite differences (about eight evaluations per coordinate), a trial that is not urgent
 # (see URGENT_RATIO) also waits until the run has cost this number of evaluations per independent coordinate
 MIN_COST_PER_COORDINATE = 64.0
 TRIAL_COST = 300.0  # approximate cost of a trial of the implicit method, in evaluations of the implicit method
-MIN_COST_IN_TRIALS = 3.0  # a trial that is not urgent (URGENT_RATIO) waits until the run has cost this number of trials
-COUNTED_FRACTION_OF_RUN = 0.3  # the cost so far counts as at least this fraction of the expected cost of the whole run
+MIN_COST_IN_TRIALS = 3.0  # a trial begins only if urgent (URGENT_RATIO), or if run's cost / trial's cost exceeds this
+COUNTED_FRACTION_OF_RUN = 0.3  # compared with trials, a run costs at least this fraction of its expected total cost
 # however small the largest rate is, a first trial begins when the run has cost as much as
 # COST_OF_ANY_TRIAL * MIN_COST_IN_TRIALS trials. After k trials, the next one begins at k + 1 times this cost
 COST_OF_ANY_TRIAL = 100.0
 MIN_RATIO_TO_MOTION = 30.0  # the largest rate is far above `_motion_rate` if it exceeds this times `_motion_rate`
 QUIET_FACTOR = 10.0  # vibrations count as small if their velocities are at most this number of tolerances
-# small vibrations, or a largest rate far above `_motion_rate`, are reasons for a trial only if step size *
-# (largest rate) / (stability limit) exceeds this
+# a trial may begin because vibrations are small, or because the largest rate is far above `_motion_rate`. Then this is
+# the smallest allowed step size * (largest rate) / (stability limit)
 MIN_HIDDEN_RATIO = 0.05
 DIFFERENCE_STEP = 1e-4  # time step of the finite difference in `_motion_rate`, relative to 1 / (largest rate)
 RETURN_BELOW = 0.4  # the explicit method is tried again if step size * (largest rate) / (stability limit) is below this
@@ -226,7 +226,7 @@ def _largest_rate(f, w, memory, t, state, new_state):
 def _motion_rate(f, w, t, state, rate, Q, V, A):
     """Return the rate (1/s) at which the motion changes: the larger of max|a| / max|v| and max|da/dt| / max|a|.
 
-    Return inf if this is unknown. `rate`: largest rate rho, which sets the time step for da/dt. (Q, V, A): scratch.
+    Return inf if v or a is zero, or da/dt is unknown. `rate`: largest rate, see DIFFERENCE_STEP. (Q, V, A): scratch.
     """
     n = Q.size
     dt = DIFFERENCE_STEP / rate
@@ -305,7 +305,7 @@ def _judge_trial(w, options, memory, t):
 
 @compiled
 def _phase_to_begin(f, w, options, memory, tolerances, t, state, new_state):
-    """Estimate the largest rate. If a trial must begin, return its phase, ON_TRIAL or BACK_ON_TRIAL, otherwise -1."""
+    """Estimate the motion's largest rate; return ON_TRIAL or BACK_ON_TRIAL if this trial must begin now, else -1."""
     n = w.Q.size
     memory[RATE] = _largest_rate(f, w, memory, t, state, new_state)
     cost_per_second, cost = _cost_per_second(w, options, memory, t), _cost_of_run(w, options)
@@ -317,8 +317,8 @@ def _phase_to_begin(f, w, options, memory, tolerances, t, state, new_state):
         memory[N_ABOVE_LIMIT] += 1.0
     if memory[ESTIMATES_TO_WAIT] > 0.0:
         return -1
-    # `counted` is the cost of the run so far or, if larger, a fraction of the expected cost of the whole run. Unless a
-    # trial is cheap compared with `counted`, it begins only if h_rho exceeds URGENT_RATIO
+    # `counted` is the cost of the run so far or, if larger, a fraction of the expected cost of the whole run. If a
+    # trial is not cheap compared with `counted`, it begins only if it is urgent, that is, if h_rho > URGENT_RATIO
     counted, min_cost = cost, MIN_COST_IN_TRIALS * TRIAL_COST * options[COST_RATIO]
     if np.isfinite(tolerances[GAP]):
         counted = max(counted, COUNTED_FRACTION_OF_RUN * tolerances[GAP] / MAX_GAP_RATIO * cost_per_second)
@@ -331,13 +331,13 @@ def _phase_to_begin(f, w, options, memory, tolerances, t, state, new_state):
         is_hidden = _has_small_vibrations(w, tolerances, state, memory[RATE])
         if not is_hidden:
             is_hidden = memory[RATE] > MIN_RATIO_TO_MOTION * _motion_rate(f, w, t, state, memory[RATE], Q, V, A)
-    # a costly run starts a trial however small the largest rate is: friction is stiff only while it reverses, and few
-    # estimates fall into this time. Short steps at the start make a run look costly: so require cost > min_cost
+    # if a run is costly, a trial begins even if the largest rate is small: friction is stiff only while it reverses, so
+    # that estimates may miss this time. As short first steps make the expected cost too large, require cost > min_cost
     is_costly = is_cheap and cost > min_cost and counted > COST_OF_ANY_TRIAL * min_cost * (1.0 + memory[N_TRIALS])
     is_due = (
         h_rho > URGENT_RATIO or is_hidden or is_costly or (memory[N_ABOVE_LIMIT] >= options[N_ESTIMATES] and is_cheap)
     )
-    if is_cheap and h_rho <= 1.0:  # otherwise, keep N_ABOVE_LIMIT, which may start a trial later
+    if is_cheap and h_rho <= 1.0:  # until a trial is cheap, N_ABOVE_LIMIT is kept, and may start a trial later
         memory[N_ABOVE_LIMIT] = 0.0
     is_expensive = cost_per_second > MIN_GAIN * memory[COST_PER_SECOND]  # more than with the explicit method
     if (memory[PHASE] == EXPLICIT and is_due) or (memory[PHASE] == IMPLICIT and (h_rho < RETURN_BELOW or is_expensive)):
@@ -395,14 +395,14 @@ def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
     w.reuse = max(rule[REUSE_OF], w.rounded)
     if is_explicit:
         code, error, factor = f.attempt_first(f, w, options[N_OPTIONS:begin], first, t, h, tolerances, state, new_state)
-        # a step of fixed size that does not converge cannot be shortened: switch to the implicit method, and repeat it
+        # a step of fixed size that does not converge cannot be shortened: repeat this step with the implicit method
         if code == OUTER_DIVERGED and tolerances[ESTIMATE] == 0.0 and f.form != FIXED_ORDER:
             _begin_phase(w, options, memory, IMPLICIT, t)
             second[:] = 0.0
             w.explicit_step = 0.0
             code, error, factor = f.attempt_second(f, w, options[begin:], second, t, h, tolerances, state, new_state)
     else:
-        # the second method does not evaluate the equations within its steps: reject steps longer than tolerances[GAP]
+        # reject steps that exceed tolerances[GAP], the longest allowed time between evaluations of the equations
         ratio = gap_ratio(tolerances, h)
         if ratio > 0.0:
             return Attempt(DONE, ratio, 1.0 / ratio)

@@ -63,7 +63,7 @@ from twoloop.kernels.steps.velocity_errors import LONGEST_GAPS, SLOW_FACTOR, STE
     BEGIN_Q,  # q at the beginning of this step; the next two blocks contain v and a there
     BEGIN_V,
     BEGIN_A,
-    SUMS,  # scratch
+    SUMS,  # scratch, mostly for sums over stages, such as sum_k A_jk a_k
     MIDDLE_Q,  # q in the middle of the step; the next two blocks contain v and a there
     MIDDLE_V,
     MIDDLE_A,
@@ -85,7 +85,7 @@ DERIVATIVE_Q, DERIVATIVE_V, SYSTEMS = range(3)
 
 
 def memory_size(s: int, n: int) -> int:
-    """Return the length of the method's memory, in vectors, for s stages and n coordinates."""
+    """Return the length of the method's memory for s stages and n coordinates, in vectors with one number per lane."""
     n_systems = (s + 1) // 2  # one linear system for each real eigenvalue and each complex pair of the tableau's matrix
     return N_SINGLE_VECTORS + (N_VECTORS + N_BLOCKS * s + n_systems) * n + s * s + (SYSTEMS + 2 * n_systems) * n * n
 
@@ -229,7 +229,7 @@ def predict_stages(settings, c, work, begins):
 
     PREVIOUS belongs to the last accepted step. If the new step size X exceeds MAX_STEP_RATIO times the size of that
     step, the polynomial would be extrapolated too far: then all predictions are the accelerations where the new step
-    begins. `begins`: 1 if the new step follows the accepted step, 0 if it is the first part of the accepted step.
+    begins. `begins`: 1 if the new step begins at the end of the accepted step, 0 if at the beginning of that step.
     """
     n = settings[at.N]
     memory = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])[7]
@@ -261,7 +261,7 @@ def predict_stages(settings, c, work, begins):
 
 @compiled
 def _compute_residuals(code, settings, control, A, A2, c, work):
-    """Store RESIDUAL = F - STAGES (F: accelerations by the equations), SCALE_Q, SCALE_V; on failure, ACTIVE = 0."""
+    """Store RESIDUAL (accelerations by the equations, minus STAGES), SCALE_Q, SCALE_V; set ACTIVE to 0 on failure."""
     n, order = settings[at.N], settings[at.ORDER]
     _, new, _, _, a, _, _, memory = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])
     s = c.size
@@ -335,7 +335,7 @@ def _raise_to_largest_value(work, target, begin, n):
 
 @compiled
 def _store_largest_corrections(settings, A, A2, work):
-    """Store in LARGEST_Q, LARGEST_V the largest changes of q and v by CHANGES, divided by X^2 and X (X: step size)."""
+    """Store in LARGEST_Q, LARGEST_V the largest changes of q / X^2, v / X by the corrections CHANGES (X: step size)."""
     n = settings[at.N]
     memory = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])[7]
     s = A.shape[0]
@@ -442,7 +442,7 @@ def _store_embedded_estimate(settings, method_options, A, work, memory):
         total += e[i]
     for i in range(n * LANES):
         work[e_q * LANES + i] = (gamma0 + total) * work[begin * LANES + i]
-    for j in range(s):  # add e_j, the weight of stage j, times H sum_k A_jk a_k, the change of v until the stage
+    for j in range(s):  # the change of v until stage j is H sum_k A_jk a_k: add its product with the weight e_j
         sum_rows(A[j], stage_rows, vector_range(work, sums, n))
         for i in range(n * LANES):
             work[e_q * LANES + i] += e[j] * work[at.H * LANES + i % LANES] * work[sums * LANES + i]
@@ -495,7 +495,7 @@ def _filtered_velocity_error(control, work, n, memory, z, state, new, k):
         largest_a = max(largest_a, abs(work[(begin + n + j) * LANES + k]))
         largest_error = max(largest_error, abs(work[(twice + j) * LANES + k]))
         difference = work[(twice + j) * LANES + k] - 2.0 * work[(once + j) * LANES + k] + work[(raw + j) * LANES + k]
-        largest_difference = max(largest_difference, abs(difference))  # max|(z J)^2 E_V|, see `_filter_errors`
+        largest_difference = max(largest_difference, abs(difference))  # max|(z J)^2 E_V| (z, J: see `_filter_errors`)
     if largest_error > 0.0:
         work[(memory + DURATION) * LANES + k] = z * np.sqrt(largest_error / largest_difference)
     duration = work[(memory + DURATION) * LANES + k]
@@ -529,7 +529,7 @@ def _motion_time(control, work, n, memory, k):
 
 @compiled
 def _add_error_in_slow_directions(settings, control, method_options, s, work):
-    """Raise ERROR to the error that the slowly changing part of E_V causes, if it is larger; see velocity_errors.py."""
+    """If the slowly changing part of the velocity error E_V causes an error larger than ERROR, set ERROR to this."""
     n = settings[at.N]
     state, new, _, _, _, _, _, memory = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])
     e_v, error_field, fine_copy = vector_offset(memory, n, E_V), memory + LARGEST_V, memory + ITERATING

@@ -34,7 +34,7 @@ ORDER_CHOSEN, SINGULAR_MATRIX, TOO_MANY_ENTRIES = range(3)  # codes of `choose_o
     N_HEAD,
 ) = range(7)
 # The array `values` contains the diagonal, then the rows of U from the last to the first, then the rows of L from the
-# first to the last. The array `index` contains the numbers above, and then
+# first to the last. The array `index` contains the N_HEAD numbers SIZE to WIDTH, and then
 # - row indices of the Jacobian, then its column indices, both in the order of elimination
 # - row exchanges by `lu_factor`, if the factors are dense
 # - indices in `values` where each row of U begins, where each row of U ends, where each row of L begins, where L ends
@@ -53,8 +53,8 @@ ORDER_CHOSEN, SINGULAR_MATRIX, TOO_MANY_ENTRIES = range(3)  # codes of `choose_o
     LOOKUP,  # scratch, for each row (or column): where its entry in the current column (or row) is stored
     N_COUNTS,
 ) = range(7)
-# indices in `lists`, scratch for choosing an order. COLUMNS, SOURCES: for each row, the columns of its entries, and the
-# indices of their initial values in the argument `entries` of `factor`. ROWS: for each column, the rows of its entries
+# indices in `lists`, scratch for choosing an order. COLUMNS: for each row, columns of its entries. SOURCES: where the
+# initial values of these entries are in the argument `entries` of `factor`. ROWS: for each column, rows of its entries
 COLUMNS, SOURCES, ROWS, N_LISTS = range(4)
 
 

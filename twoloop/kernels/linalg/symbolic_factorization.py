@@ -53,16 +53,16 @@ class _DisjointSets:
 
 
 class _PartSupports:
-    """Record the supports (ground and hubs, see the module's docstring) of each part during the elimination."""
+    """Record which hubs, or the ground, support each part (set of connected bodies); see the module's docstring."""
 
     def __init__(self, joints: Sequence[frozenset[int]], n_bodies: int, hubs: set[int], lone_bodies: AbstractSet[int]):
         self.joints, self.hubs = joints, set(hubs)  # bodies of each joint; hubs that are not eliminated yet
-        # hubs with a single coordinate: joints with such hubs may immobilize a part, so count as joints with the ground
+        # hubs with one coordinate: a joint with such a hub may immobilize a part, and counts as a joint with the ground
         self.lone_bodies = lone_bodies
         self.parts = _DisjointSets(n_bodies)
         self.is_grounded = [False] * n_bodies
         self.hubs_by_part: list[set[int]] = [set() for _ in range(n_bodies)]  # index: smallest body of the part
-        self.supported_bodies: dict[int, list[int]] = {hub: [] for hub in hubs}  # a body of each part supported so far
+        self.supported_bodies: dict[int, list[int]] = {hub: [] for hub in hubs}  # bodies of parts that a hub supports
 
     def can_eliminate(self, joint: int) -> bool:
         """Return True if a joint may be eliminated before the remaining hubs (bodies with many joints).
@@ -78,13 +78,13 @@ class _PartSupports:
         return not bodies & self.hubs and not any(self.hubs_by_part[p] for p in parts)
 
     def eliminate_joint(self, joint: int) -> None:
-        """Merge the parts (sets of connected bodies) that an eliminated joint connects, and update their supports."""
+        """Merge parts (sets of connected bodies) that an eliminated joint connects; note which hubs support them."""
         bodies = self.joints[joint]
         is_grounded = len(bodies) == 1 or bool(bodies & self.lone_bodies)
         self._merge_parts((body for body in bodies if body not in self.hubs), is_grounded, bodies & self.hubs)
 
     def eliminate_hub(self, hub: int) -> None:
-        """Merge an eliminated hub (body with many joints) and the parts that it supports, and update their supports."""
+        """Merge an eliminated hub (body with many joints) with the parts that it has supported until now."""
         self.hubs.discard(hub)
         supported_bodies = self.supported_bodies.pop(hub)
         for body in supported_bodies:
@@ -193,7 +193,7 @@ def _minimum_degree_order(
 ) -> list[int]:
     """Return the order of elimination of joints and hubs as indices: k for joint k, len(joints) + k for hub k.
 
-    Hubs are bodies with many joints. Of the allowed joints and hubs, the next one is that whose neighbours have the
+    Hubs are bodies with many joints. Next is the hub, or joint allowed by `can_eliminate`, whose neighbours have the
     fewest rows and coordinates (`sizes`). `pairs`: hubs coupled without a joint. `lone_bodies`: see `_PartSupports`.
     """
     n_joints = len(joints)
@@ -250,8 +250,8 @@ Entries = tuple[Integers, Integers]  # row indices and column indices of the non
     N_OFF_DIAGONAL,  # number of entries of L below the diagonal
     N_UPDATES,  # number of updates in the elimination, each a multiplication and a subtraction
     N_RUNS,  # length of the list from `update_runs_of`: two numbers for each range of updates
-    N_OF_MASS,  # number of listed entries of the mass matrix M
-    N_OF_JACOBIAN,  # number of listed entries of the constraint Jacobian G
+    N_OF_MASS,  # number of entries of the mass matrix M in the list from `mass_entries_of`
+    N_OF_JACOBIAN,  # number of entries of the constraint Jacobian G in the list from `jacobian_entries_of`
     N_STIFFENED,  # number of products g_i g_j in the terms s g^T g (g: row of G) that are added to a singular M
     N_HEAD,
 ) = range(9)
@@ -328,11 +328,11 @@ def program_in_order(
 
 
 def _update_runs(targets: Integers, diagonal: NDArray[np.bool_]) -> Integers:
-    """Divide the elimination's updates of off-diagonal entries into ranges that change adjacent entries.
+    """Find ranges of adjacent off-diagonal entries that successive updates of the elimination change.
 
     `targets`: for each update, the index of the entry that it changes; `diagonal`: whether this entry is on the
     diagonal. Return the length of each range and the index of its first entry. Ranges are long, because the rows of a
-    joint are adjacent in all columns: so entries are changed as vectors, and programs are a tenth as long.
+    joint are adjacent in all columns. So programs change vectors instead of entries, and are a tenth as long.
     """
     off_diagonal = np.flatnonzero(~diagonal)
     begins = np.flatnonzero(diagonal[off_diagonal - 1] | (targets[off_diagonal] != targets[off_diagonal - 1] + 1))
@@ -341,7 +341,7 @@ def _update_runs(targets: Integers, diagonal: NDArray[np.bool_]) -> Integers:
 
 
 def _products_of_entries(rows: Integers, chosen: Sequence[int]) -> tuple[Integers, Integers, Integers]:
-    """Return the row, first entry and second entry (indices) of each product in g^T g, for the rows g in `chosen`."""
+    """For all products g_i g_j in g^T g, return the indices of the row g, of g_i and of g_j; g: a row in `chosen`."""
     parts: list[tuple[Integers, Integers, Integers]] = [(rows[:0], rows[:0], rows[:0])]
     sequence = np.argsort(rows, kind="stable")
     sorted_rows = rows[sequence]
@@ -429,9 +429,9 @@ def jacobian_entries_of(program):
 
 @inlined
 def stiffening_products_of(program):
-    """Return four lists with one number for each product g_i g_j in terms s g^T g (g: row of G) added to a singular M.
+    """Return four lists of indices for the products g_i g_j in s g^T g, which is added to a singular M (g: row of G).
 
-    The numbers: index of the row g, indices of g_i and of g_j, and index, in the factors, of the changed entry of M.
+    The indices: of the row g, of g_i, of g_j, and of the entry of M (in the array of the factors) that is changed.
     """
     n = program[N_STIFFENED]
     begin = N_HEAD + 2 * program[N_PIVOTS] + 1 + program[N_OFF_DIAGONAL] + program[N_RUNS]

@@ -47,8 +47,8 @@ BACKWARD_FRACTION = 0.4  # largest part of the polynomial that precedes the step
 ORDER, ERROR_FACTOR = 12.0, 0.5  # the error estimate has the factor ERROR_FACTOR, and is about proportional to h^ORDER
 PROJECTION_WEIGHT = 0.5  # if a projection changes a stage by x tolerances, the error estimate is at least this times x
 ROUNDING = 1e-13  # relative tolerance of the iteration in steps of fixed size, and of comparisons of times
-MIN_PIVOT_RATIO = 0.5  # a step fails if the pivot at its end is below this * pivot at its beginning; see FAR_END
-END_MARGIN = 2.0  # a step fails if the pivot at its end is below this * smallest pivot allowed at nodes; see FAR_END
+MIN_PIVOT_RATIO = 0.5  # a step fails if the pivot at its end is below this * pivot at its start or `base`; see FAR_END
+END_MARGIN = 2.0  # if MAY_APPROACH is 0, the end's pivot must be at least this * pivot allowed at nodes; see FAR_END
 FAR_END = 0.3  # the pivot at the end of a step is large enough if it is at least this * largest pivot of the run so far
 LATE = S - 4  # node near a polynomial's end: if its pivot exceeds the end's, the singular position lies beyond the end
 # an attempt that computes a polynomial returns this as error and as step-size factor. So the step is repeated; it then
@@ -73,8 +73,8 @@ def begin_polynomial(memory, largest_pivot, earliest, may_approach, node_distanc
     """Discard the polynomial in `memory`, and store the conditions that the next one must satisfy.
 
     `largest_pivot` is the largest pivot of the run so far; no node may lie before the time `earliest` (s). If
-    `may_approach`, the polynomial may end before the singular position, nearer to it than it begins. `node_distance`
-    is a factor on the pivot below which nodes are left out. The polynomial goes through `base`, the time (s) and state
+    `may_approach`, the polynomial need not cross the singular position, but may end before it. The pivot below which
+    nodes are left out is multiplied by `node_distance`. The polynomial goes through `base`, the time (s) and state
     [q, v, ...] of an earlier step; if `base` is None, it goes through the state at the beginning of the step.
     """
     stored = memory[-N_STORED:]
@@ -171,9 +171,9 @@ def _choose_partition_at_end(
 ):
     """Set (q1, v1) to the end (at time t) of the polynomial of duration h; choose the partition there; return a code.
 
-    The code is SINGULAR if the end is close to the singular position, or before it. Then the pivot at the end is below
-    FAR_END times the largest pivot of the run, and below `min_pivot`. If MAY_APPROACH is 0, `min_pivot` is first raised
-    to the pivot at the node LATE, and to END_MARGIN times `min_node_pivot`, the pivot below which nodes are left out.
+    The code is SINGULAR if the pivot at the end is below `min_pivot`, and below FAR_END times the run's largest pivot:
+    the end is too near the singular position, or before it. If MAY_APPROACH is 0, `min_pivot` is raised at least to the
+    pivot at the node LATE, and to END_MARGIN times `min_node_pivot`, the pivot below which nodes are left out.
     """
     A, AA, b, bA, c = tables
     if stored[MAY_APPROACH] == 0.0:
@@ -241,8 +241,8 @@ def _polynomial_at(time, duration, b, c, a, q_0, v_0, weights_v, weights_q, q, v
 def _finish_piece(f, w, t, min_node_pivot, options, tolerances, stage, state, new_state):
     """Finish a step: project its end `stage` = [q, v, a], store it in `new_state`, and return an Attempt.
 
-    If `min_node_pivot` is positive, and the smallest pivot is below it or the projection fails, the state is stored
-    without projection.
+    If the smallest pivot is below `min_node_pivot`, or the projection fails, store the state without projection. If
+    `min_node_pivot` is 0, never do so, but return the code of a projection that fails.
     """
     n = w.Q.size
     q, q1, v1 = state[:n], new_state[:n], new_state[n : 2 * n]
@@ -276,7 +276,7 @@ def state_at(memory, options, t):
     b, _, c = options[N_SCALARS + 3 * S * S :].reshape((3, S))
     a, stage = memory[: S * n].reshape((S, n)), memory[S * n : (S + 5) * n].reshape((5, n))
     fraction, duration, (q_0, v_0) = (t - stored[BEGIN]) / stored[DURATION], stored[DURATION], stage[3:]
-    # values of the Lagrange polynomials at the Gauss nodes of the interval from the beginning to t, and at t
+    # values of the Lagrange polynomials at S Gauss nodes between the polynomial's beginning and t, and at t (last row)
     weights = np.array([lagrange_values(c, x) for x in (*(fraction * c), fraction)])
     weights_v = fraction * b @ weights[:-1]
     weights_q = fraction**2 * (b * (1.0 - c)) @ weights[:-1]
@@ -293,7 +293,7 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
     b, bA, c = options[N_SCALARS + 3 * S * S :].reshape((3, S))
     a, stage, offset = memory[: S * n].reshape((S, n)), memory[S * n : (S + 5) * n].reshape((5, n)), (S + 7) * n
     q_stage, v_stage, a_stage, q_0, v_0 = stage[0], stage[1], stage[2], stage[3], stage[4]
-    kept, weights_v, weights_q = memory[offset : offset + 3 * S].reshape((3, S))  # kept[j]: j; -1: node j is left out
+    kept, weights_v, weights_q = memory[offset : offset + 3 * S].reshape((3, S))  # kept[j]: j; -1 if node j is left out
     stored = memory[offset + 3 * S :]
     largest_pivot, earliest, time_of_base = stored[LARGEST_PIVOT], stored[EARLIEST], stored[BASE]
     is_estimated, uses_generated_code = tolerances[ESTIMATE] == 1.0, f.is_generated == 1
@@ -314,7 +314,7 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
         if is_estimated:
             duration = h + max(0.0, min(h * BACKWARD_FRACTION / (1.0 - BACKWARD_FRACTION), t - earliest))
     begin, c0 = t + h - duration, (duration - h) / duration
-    c_base = c0 if t_base == t else 0.0  # time from the polynomial's beginning to `base` / its duration
+    c_base = c0 if t_base == t else 0.0  # (time from the polynomial's beginning to `base`) / (polynomial's duration)
     _fill_integral_weights(b, c, c_base, weights_v, weights_q)
     n_before_base = 0  # number of nodes before the state `base`
     while n_before_base < S and c[n_before_base] < c_base:

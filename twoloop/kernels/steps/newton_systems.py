@@ -88,7 +88,7 @@ DISPLACEMENT_INCREMENT, N_INCREMENTS = 0.37, 7
 
 @inlined
 def _displacement_sizes(tolerances, x):
-    """Return the typical and the largest size of components of x (q or v), from which displacements follow."""
+    """Return two sizes of x (q or v) for finite differences: the typical one, and the largest |component|."""
     return typical_size(tolerances, x), largest_of(x)
 
 
@@ -189,7 +189,7 @@ def fill_tangent_by_q(f, w, tolerances, t, q, v, b, moved, K, R):
 
 @compiled
 def fill_tangent_by_v(f, t, q, v, b, D):
-    """Store the entries of dQ/dv (Q: forces) with |i - j| <= b in D (n_q, n_q), if dQ/dv is given; return a code."""
+    """If a callback gives dQ/dv (Q: forces), store its entries with |i - j| <= b in D; return DONE or NOT_FINITE."""
     if f.force_by_v_given == 0:
         return DONE
     _clear_band(D, b)
@@ -534,8 +534,8 @@ def _filter_error_banded(f, w, options, memory, s, h, e_q, e_v):
 
 # --- sparse storage, for all coordinates
 
-# K lacks entries if a displacement d of q changes a component i of the residual by a number that differs from
-# sum_j K_ij d_j by more than this fraction of sum_j |K_ij d_j|. D, the derivative by v, is tested like K
+# the change of component i of the residual by a displacement d of q is compared with sum_j K_ij d_j. If they differ by
+# more than this fraction of sum_j |K_ij d_j|, then K lacks entries. D, the derivative by v, is tested like K
 MAX_DEVIATION = 0.2
 RESIDUAL_ROUNDING = 1e-13  # rounding error of a difference of residuals, relative to the largest term of a residual
 N_SPARSE_VECTORS = 3  # number of real scratch vectors, which _sparse_scratch returns first
@@ -556,7 +556,7 @@ def matrices_size(program: np.ndarray, n_mass: int, n_jacobian: int, n_systems: 
 def _sparse_derivative_views(f, w):
     """Return six views of w.matrices: the entries of M, G, K and D, then `is_independent` and `stiffness`.
 
-    For each row g of G, `is_independent` is 1 or 0, and `stiffness` is s if s g^T g is added to a singular M.
+    For each row g of G, `is_independent` is 1 or 0. If s g^T g is added to a singular M, `stiffness` is the factor s.
     """
     n_mass, n_jacobian, n_rows = w.mass_values.size, w.jacobian_values.size, w.is_independent.size
     begin_K = n_mass + n_jacobian
@@ -575,7 +575,7 @@ def _sparse_derivative_views(f, w):
 
 @inlined
 def _sparse_scratch(f, w):
-    """Return scratch views of w.matrices: three vectors (n_q), pivot sizes (N = n_q + n_c), two complex vectors (N)."""
+    """Return scratch views of w.matrices: three vectors (n_q), one (N, the number of pivots), two complex ones (N)."""
     n, begin = f.newton_program[N_PIVOTS], w.mass_values.size + w.jacobian_values.size
     begin += 2 * (mass_entries_of(f.newton_program)[0].size - w.mass_values.size) + 2 * n
     n_q, numbers = w.Q.size, w.matrices
@@ -731,7 +731,7 @@ def _factor_sparse_matrix(f, w, z, factors):
 
 @compiled
 def _fill_sparse_right_side(f, w, r, right):
-    """Store in `right` [M r; G r] (r: residual), plus terms of redundant rows g with s g^T g in M."""
+    """Store [M r; G r] in `right` (r: residual), plus s g^T g r for redundant rows g whose s g^T g is added to M."""
     mass, jacobian, _, _, is_independent, stiffness = _sparse_derivative_views(f, w)
     right[:] = 0.0
     rows, columns, _ = mass_entries_of(f.newton_program)
@@ -840,7 +840,7 @@ def solve_system(f, w, options, memory, s, k, x):
     If this eigenvalue is real, only the real part of x is used, and the solution is real.
     """
     n = w.Q.size
-    if k == 0 and options[newton_options_index(s) + at.N_REAL] > 0.0:  # the eigenvalue is real, and equals GAMMA0
+    if k == 0 and options[newton_options_index(s) + at.N_REAL] > 0.0:  # real: `factor_filter` factorized its matrix
         real_part, X = vector(memory, s, n, at.V_MOVED), vector(memory, s, n, at.Q_MOVED)
         for i in range(x.size):
             real_part[i] = x[i].real
