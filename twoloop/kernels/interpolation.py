@@ -220,7 +220,7 @@ def _state_difference(tolerances, scale_q, scale_v, states, i, q, v, q_other, v_
         change_q = scale_q * abs(q_other[m] - q[m]) / (atol + rtol * abs(states[i, m]))
         change_v = scale_v * abs(v_other[m] - v[m]) / (atol + rtol * abs(states[i, n + m]))
         largest, total = max(largest, change_q, change_v), total + change_q + change_v
-    # the sum `total` is not finite if two interpolated states have equal times (a step may be as short as rounding)
+    # if two interpolated states have equal times (a step may be as short as rounding of t), `total` is not finite
     return largest if np.isfinite(total) else np.inf
 
 

@@ -62,14 +62,14 @@ URGENT_RATIO = 3.0  # a trial is urgent (cost cannot delay it) if step size * la
 MIN_COST_PER_COORDINATE = 64.0
 TRIAL_COST = 300.0  # approximate cost of a trial of the implicit method, in evaluations of the implicit method
 MIN_COST_IN_TRIALS = 3.0  # a trial begins only if urgent (URGENT_RATIO), or if run's cost / trial's cost exceeds this
-COUNTED_FRACTION_OF_RUN = 0.3  # compared with trials, a run costs at least this fraction of its expected total cost
+COUNTED_FRACTION_OF_RUN = 0.3  # in comparison with trials, a run's cost is at least this fraction of its expected total
 # however small the largest rate is, a first trial begins when the run has cost as much as
 # COST_OF_ANY_TRIAL * MIN_COST_IN_TRIALS trials. After k trials, the next one begins at k + 1 times this cost
 COST_OF_ANY_TRIAL = 100.0
 MIN_RATIO_TO_MOTION = 30.0  # the largest rate is far above `_motion_rate` if it exceeds this times `_motion_rate`
 QUIET_FACTOR = 10.0  # vibrations count as small if their velocities are at most this number of tolerances
-# a trial may begin because vibrations are small, or because the largest rate is far above `_motion_rate`. Then this is
-# the smallest allowed step size * (largest rate) / (stability limit)
+# a trial may begin because vibrations are small, or because the largest rate is far above `_motion_rate`, but only if
+# step size * (largest rate) / (stability limit) exceeds this
 MIN_HIDDEN_RATIO = 0.05
 DIFFERENCE_STEP = 1e-4  # time step of the finite difference in `_motion_rate`, relative to 1 / (largest rate)
 RETURN_BELOW = 0.4  # the explicit method is tried again if step size * (largest rate) / (stability limit) is below this

@@ -529,7 +529,7 @@ def _motion_time(control, work, n, memory, k):
 
 @compiled
 def _add_error_in_slow_directions(settings, control, method_options, s, work):
-    """If the slowly changing part of the velocity error E_V causes an error larger than ERROR, set ERROR to this."""
+    """If the slowly changing part of the velocity error E_V causes an error larger than ERROR, set ERROR to it."""
     n = settings[at.N]
     state, new, _, _, _, _, _, memory = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])
     e_v, error_field, fine_copy = vector_offset(memory, n, E_V), memory + LARGEST_V, memory + ITERATING

@@ -840,7 +840,7 @@ def solve_system(f, w, options, memory, s, k, x):
     If this eigenvalue is real, only the real part of x is used, and the solution is real.
     """
     n = w.Q.size
-    if k == 0 and options[newton_options_index(s) + at.N_REAL] > 0.0:  # real: `factor_filter` factorized its matrix
+    if k == 0 and options[newton_options_index(s) + at.N_REAL] > 0.0:  # the eigenvalue is real, as in `filter_error`
         real_part, X = vector(memory, s, n, at.V_MOVED), vector(memory, s, n, at.Q_MOVED)
         for i in range(x.size):
             real_part[i] = x[i].real
