@@ -102,7 +102,7 @@ class LaneEmitter(Emitter):
 def load_lanes(emit: LaneEmitter, base: Value, index: int = 0) -> Value:
     """Return the vector base[index : index + STAGES]: one number for each stage of a collocation step.
 
-    The address must be aligned to the vector's size. Loading waits if the numbers have just been stored one by one.
+    The address must be aligned to the vector's size. A load is slow just after the numbers were stored one by one.
     """
     start, kind = emit.builder.advance(base, integer(index)), vector_of(DOUBLE, STAGES)
     return emit.builder.load(emit.builder.convert("bitcast", start, f"{kind}*"), 8 * STAGES)
@@ -125,7 +125,7 @@ def two_sums(emit: LaneEmitter, a: Value, b: Value) -> list[Value]:
 
 
 def gather_lane(emit: LaneEmitter, vectors: Sequence[Value], lane: int) -> Value:
-    """Return a vector of the numbers in lane `lane` of each of `vectors`; for a single vector, return its number."""
+    """Return the numbers in lane `lane` of all `vectors`, as a vector; if there is only one vector, return a scalar."""
     builder, indices = emit.builder, [lane, STAGES + lane]
     if len(vectors) == 1:
         return builder.extract(vectors[0], lane)
@@ -207,7 +207,7 @@ class LaneSeries:
         return [self.n, self.n_rows, self.early, self.late, self.rows, self.balance, self.factor_indices]
 
     def _expressions(self, sums: Sums, rows: Sequence[int]) -> list[tuple[Terms, float]]:
-        """Return (terms, constant) of each expression in `sums`; rows[k] is the number of expression k in sums.row."""
+        """Return (terms, constant) of each expression in `sums`; in sums.row, expression k has the number rows[k]."""
         more: dict[int, list[tuple[int, float]]] = {row: [] for row in rows}
         for row, i, c in zip(
             sums.row.tolist(), sums.further_column.tolist(), sums.further_coefficient.tolist(), strict=True
@@ -220,7 +220,7 @@ class LaneSeries:
         ]
 
     def _row_expressions(self, sums: Sums, indices: Any) -> list[tuple[int, tuple[Terms, float]]]:
-        """Return the pair (indices[k], (terms, constant)) for each k: expression k in `sums` is equation indices[k]."""
+        """Return pairs (i, (terms, constant)), one for each expression in `sums`; i, from `indices`: its equation."""
         return list(zip(indices.tolist(), self._expressions(sums, indices.tolist()), strict=True))
 
     def _make_operations(self, table: OperationGroups, quantity: int) -> list[Operation]:
@@ -384,7 +384,7 @@ class LaneSeries:
 
         Keys of the returned dict: ((index of X, index of Y), True for Y[k + 1 - j] or False for Y[k - j]). For these
         indices of series X and Y see `_factor_index`. `_PartialSums` adds the terms j = 1 and j = k later: these need
-        the newest coefficients, for which the loops would wait. One loop computes several sums, to load factors once.
+        coefficients that are computed after the loops. One loop computes several sums, to load factors once.
         """
         keys = [(pair, True) for pair in self.carried_pairs]
         pairs = {pair for each in (*self.early, *self.late) for pair in self._factors(each)}
@@ -421,7 +421,7 @@ class LaneSeries:
     ) -> None:
         """Write code for Taylor coefficient k = `order` > 0 of the results of `operations`; `inverse`: 1 / k.
 
-        A PENDING product has a second factor with an unknown coefficient k: the term with this coefficient is left out.
+        Coefficient k of the second factor of a PENDING product is not known yet: the term with it is left out.
         """
         pairs = list(dict.fromkeys(pair for operation in operations for pair in self._factors(operation)))
         sums = {}
@@ -475,7 +475,7 @@ class _Row:
         self._stored: dict[int, Value] = {}
 
     def store(self, key: Any, value: Value, when: str = "") -> None:
-        """Store the coefficient of the series `key`. If `when` is "if used", store it only for a factor of products."""
+        """Store the coefficient of the series `key`. If `when` is "if used", skip a series that no product contains."""
         index = self.code.factor_indices.get(tuple(key)) if when else self.code.factor_indices[tuple(key)]
         if index is not None and index not in self._stored:
             self._stored[index] = value
@@ -490,7 +490,7 @@ class _PartialSums(NamedTuple):
     """Sums over 1 < j < k of products of coefficients of series X and Y; methods add the terms for j = 1 and j = k."""
 
     sums: dict[tuple[tuple[int, int], bool], Value]  # result of `LaneSeries._write_sums`
-    first_row: Value  # pointer to `row_1`; if k is 1, to a row of zeros, so that products with it are 0
+    first_row: Value  # pointer to `row_1` if k > 1, else to a row of zeros: products with its entries are then 0
     row_1: Value  # pointer to coefficient 1 of all series
     row_before: _Row  # memory that contains coefficient k - 1 of all series
 
@@ -500,7 +500,7 @@ class _PartialSums(NamedTuple):
         return self.sums[pair, False] + emit.load(self.first_row, x) * self.row_before.load(y)
 
     def sum_of_next_order(self, pair: tuple[int, int], row: _Row) -> Value:
-        """Return the sum of X[j] Y[k + 1 - j] over 0 < j <= k; `pair`: indices of X and Y; `row` has X[k] and Y[k]."""
+        """Return the sum of X[j] Y[k + 1 - j] over 0 < j <= k; `pair`: indices of series X, Y; `row` has X[k], Y[k]."""
         emit, (x, y) = self.row_before.emit, pair
         total = self.sums[pair, True] + row.load(x) * emit.load(self.first_row, y)
         return total + emit.load(self.row_1, x) * row.load(y)

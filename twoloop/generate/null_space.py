@@ -22,7 +22,7 @@ import numpy as np
 from twoloop.generate.graph import Affine, is_zero
 
 # accelerations are invalid if a step of refinement changes them by more than this fraction. The relative error after
-# refinement is usually the square of the change, and as large as the change only if a light body's digits are all lost
+# refinement is usually (change)^2; it is as large as the change only if a light body's acceleration had no exact digit
 LARGEST_CHANGE = 1e-7
 
 
@@ -30,7 +30,7 @@ class Block(NamedTuple):
     """Pivot block of the factorization L D L^T: one or two rows that are eliminated together, with one division."""
 
     row_indices: tuple[int, ...]
-    inverse: list[list[Affine]]  # inverse of this 1x1 or 2x2 block of the matrix D in L D L^T
+    inverse: list[list[Affine]]  # inverse of the pivot block, a 1x1 or 2x2 block of the matrix D
     rows_below: list[tuple[int, list[Affine]]]  # index and entries of each nonzero row of L below the block
 
 
@@ -73,7 +73,7 @@ class Factors:
     def _inverse(self, pivots: list[list[Affine]], own_pivots: list[Any]) -> list[list[Affine]]:
         """Return the inverse of a 1x1 or 2x2 pivot block, and append its pivots to `mass_pivots` or `conditions`.
 
-        `own_pivots`: for each row, the pivot it would have if G had no other rows; None: `mass_pivots` gets its pivot.
+        `own_pivots`: for each row, the pivot if G had no other rows; None: the row's pivot is added to `mass_pivots`.
         """
         diagonal = [None if pivot is None else pivot.as_term() for pivot in own_pivots]
         a = pivots[0][0]
@@ -344,7 +344,7 @@ def _pivot_conditions(matrix: dict[tuple[int, int], Affine], factors: Factors) -
         first_pivot: Affine | None = None
         for i in row_indices:
             pivot = next(pivots)
-            # the second pivot of a block is its determinant, which has the first pivot as a factor: so has `scale`
+            # the second pivot of a block, its determinant, is proportional to the first pivot: multiply `scale` by that
             scale = matrix[i, i] if first_pivot is None else first_pivot * matrix[i, i]
             first_pivot = pivot
             if pivot.terms:

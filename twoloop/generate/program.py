@@ -1,4 +1,4 @@
-"""Programs: operations of traced callbacks, recorded in a graph, and arrays of affine expressions of their results.
+"""Programs: operations that tracing has recorded in a graph, and arrays of affine expressions of the results.
 
 - `Program.run` executes a program in an algebra, which defines what a value is: an array of numbers (`ArrayAlgebra`), a
   value in generated code (`llvm_code.Lowering`), or a polynomial degree (`time_dependence.DegreeAlgebra`).
@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 T = TypeVar("T")
 
 N_COMPARED = 5  # number of states at which a user's traced function is compared with calls of the function
-TIME_SPACING = 0.37  # time (s) between successive compared states; unlikely to be the period of a force
+TIME_SPACING = 0.37  # time (s) between two states at which call and trace are compared; unlikely to be a force's period
 MAX_TRACE_DIFFERENCE = 1e-10  # a trace is wrong if its relative error exceeds this: rounding errors are smaller
 
 # cost of operations by kind, in multiplications; the cost of other operations is not counted
@@ -202,7 +202,7 @@ class OperationTable(NamedTuple):
         )
 
     def as_floats(self) -> list[float]:
-        """Return the table as floats, for the parameters of a model; the results become the first nodes."""
+        """Return the table as floats, which bodies/read_tables.py executes; here the first nodes are the results."""
         rows = self.rows.copy()
         is_result = rows[:, KIND] == RESULT
         n_results = int(is_result.sum())
@@ -212,7 +212,7 @@ class OperationTable(NamedTuple):
         return [float(x) for part in parts for x in part]
 
     def as_arrays(self, result_indices: Sequence[int]) -> tuple[Any, Any]:
-        """Return the table as integers and floats; `result_indices`: indices of results in a callback's array."""
+        """Return the table as integers and floats; `result_indices`: index of each result in a callback's output."""
         rows, n = self.rows.copy(), len(result_indices)
         rows[rows[:, KIND] == RESULT, NODE] += self.n_nodes
         header = [self.n_nodes + n, len(rows), len(self.columns), n]
@@ -226,7 +226,7 @@ class OperationTable(NamedTuple):
 
 Terms = tuple[tuple[int, float], ...]  # pairs of a quantity and its coefficient
 
-LITERALS = (0.0, 1.0, -1.0)  # coefficients that are part of generated code: they need no multiplication
+LITERALS = (0.0, 1.0, -1.0)  # numbers that generated code does not read from arrays: it needs no product with them
 LITERAL_TOLERANCE = 8.0 * 2.0**-52  # largest difference between a coefficient and the literal 1 or -1 that replaces it
 
 
@@ -278,7 +278,7 @@ class Coefficients:
 
     @property
     def formulas(self) -> Any:
-        """Return an array of the coefficients (floats or Parameters); it stays the same object until one is added."""
+        """Return an array of the coefficients (floats or Parameters); the same object until a coefficient is added."""
         if len(self._formulas) != len(self._values):
             self._formulas = number_array(self._values)
         return self._formulas

@@ -265,7 +265,7 @@ TRACING_ORDER = (
     *("constraint", "constraint_rate", "jacobian", "nonholonomic", "nonholonomic_rate", "mass", "force"),
     *("gamma", "nonholonomic_gamma"),
 )
-# keys: callbacks for gamma. Values: the two callbacks (C_q and C_t, or A and b) whose derivatives yield gamma, too
+# keys: callbacks for gamma. Values: the two callbacks (C_q and C_t, or A and b) whose derivatives also give gamma
 GAMMA_SOURCES = {"gamma": ("jacobian", "constraint_rate"), "nonholonomic_gamma": ("nonholonomic", "nonholonomic_rate")}
 
 
@@ -425,7 +425,7 @@ class TraceCache:
     """Cache of traces, and of results derived from traces, for all systems that share their callbacks.
 
     parameters : parameters of one of the systems.
-    classes : class of each parameter. 0: the parameter is a constant in the traces. 1, 2, ...: number of a class, whose
+    groups : group of each parameter. 0: the parameter is a constant in the traces. 1, 2, ...: number of a group, whose
         parameters have equal magnitudes; with a minus sign if the parameter is negative.
     Fields:
     parameters : parameters with which callbacks are traced: Parameters with random values, and constants.
@@ -433,17 +433,17 @@ class TraceCache:
     within_bounds : names of traced callbacks that were found, for one of the systems, to use no index out of bounds.
     """
 
-    def __init__(self, parameters: Array, classes: NDArray[np.int64]):
-        self._classes = classes
-        size = int(np.abs(self._classes).max(initial=0))
-        _, first = np.unique(np.abs(self._classes), return_index=True)
-        self._first_of_class = first[self._classes[first] != 0]  # index of the first parameter in class 1, 2, ...
+    def __init__(self, parameters: Array, groups: NDArray[np.int64]):
+        self._groups = groups
+        size = int(np.abs(self._groups).max(initial=0))
+        _, first = np.unique(np.abs(self._groups), return_index=True)
+        self._first_of_group = first[self._groups[first] != 0]  # for each group, the index of its first parameter
         self._tape = ParameterTape(np.random.default_rng(7).uniform(*GENERIC_RANGE, size).tolist(), range(size))
-        self.parameters = parameters.astype(object) if self._classes.any() else parameters.copy()
-        for i in np.flatnonzero(self._classes).tolist():
-            signed_class = int(self._classes[i])
-            parameter = self._tape.parameters[abs(signed_class) - 1]
-            self.parameters[i] = parameter if signed_class > 0 else -parameter
+        self.parameters = parameters.astype(object) if self._groups.any() else parameters.copy()
+        for i in np.flatnonzero(self._groups).tolist():
+            signed_group = int(self._groups[i])
+            parameter = self._tape.parameters[abs(signed_group) - 1]
+            self.parameters[i] = parameter if signed_group > 0 else -parameter
         self.traced_kinds: set[str] = set()
         self.within_bounds: set[str] = set()
         self._results: dict[Any, Any] = {}
@@ -459,8 +459,8 @@ class TraceCache:
         return traced.copy()
 
     def magnitudes(self, parameters: Array) -> Array:
-        """Return the magnitudes of the parameters in the classes 1, 2, ... (see TraceCache), one for each class."""
-        return np.abs(parameters[self._first_of_class])
+        """Return the magnitude of the parameters in each of the groups 1, 2, ... (equal magnitudes, see TraceCache)."""
+        return np.abs(parameters[self._first_of_group])
 
     def product_evaluator(self, parameters: Array) -> Callable[[Powers], Any]:
         """Return a function that evaluates products of powers (type `Powers`) for the `parameters` of one system."""
@@ -561,14 +561,14 @@ def shared_cache(system: ConstrainedSystem) -> TraceCache:
 
 
 def trace_cache_of(system: ConstrainedSystem) -> TraceCache:
-    """Return the TraceCache of all systems with equal compiled callbacks, sizes, parameter classes and constants."""
+    """Return the TraceCache of all systems with equal callbacks, sizes, constant parameters and parameter groups."""
     parameters = system.parameters
-    classes = _parameter_classes(parameters)
-    fixed_parameters = parameters[classes == 0] + 0.0  # -0.0 becomes 0.0, so that keys with zeros are equal
-    key = (*system.given.items(), system.n_q, system.n_c, system.n_a, classes.tobytes(), fixed_parameters.tobytes())
+    groups = _parameter_groups(parameters)
+    fixed_parameters = parameters[groups == 0] + 0.0  # -0.0 becomes 0.0, so that keys with zeros are equal
+    key = (*system.given.items(), system.n_q, system.n_c, system.n_a, groups.tobytes(), fixed_parameters.tobytes())
     cache: TraceCache | None = _TRACE_CACHES.get(key)
     if cache is None:
-        _TRACE_CACHES[key] = cache = TraceCache(parameters, classes)
+        _TRACE_CACHES[key] = cache = TraceCache(parameters, groups)
     return cache
 
 
@@ -577,25 +577,25 @@ def _own_cache(system: ConstrainedSystem) -> TraceCache:
     return TraceCache(system.parameters, np.zeros(system.parameters.size, dtype=np.int64))
 
 
-def _parameter_classes(parameters: Array) -> NDArray[np.int64]:
-    """Return the class (see TraceCache) of each parameter: 0 for constants; equal magnitudes have the same number."""
+def _parameter_groups(parameters: Array) -> NDArray[np.int64]:
+    """Return the group (see TraceCache) of each parameter: 0 for constants; equal magnitudes have the same number."""
     magnitudes = np.abs(parameters)
     varies = (magnitudes > MIN_MAGNITUDE) & (magnitudes < 1.0 / MIN_MAGNITUDE) & (magnitudes != np.floor(magnitudes))
     _, first, inverse = np.unique(magnitudes[varies], return_index=True, return_inverse=True)
     rank = np.empty(len(first), dtype=np.int64)
     rank[first.argsort()] = np.arange(1, len(first) + 1)
-    classes = np.zeros(len(magnitudes), dtype=np.int64)
-    classes[varies] = np.copysign(rank[inverse], parameters[varies])
-    return classes
+    groups = np.zeros(len(magnitudes), dtype=np.int64)
+    groups[varies] = np.copysign(rank[inverse], parameters[varies])
+    return groups
 
 
 class ParameterArrays:
     """Arrays of numbers that stand for arrays of expressions; `write` overwrites them by values for new parameters."""
 
     def __init__(self) -> None:
-        # keys: id of an array of expressions. Values: this array, stored so that no other gets its id, and its numbers
+        # keys: id of an array of expressions. Values: its numbers, and the array, so that no other array gets this id
         self._arrays: dict[int, tuple[Any, Array]] = {}
-        # for each array: its numbers (flat); indices of varying entries; slice of `values` in `write` for these entries
+        # for each array (numbers, indices, slice): `write` stores values[slice] in numbers[indices], the varying entries
         self._number_arrays: list[tuple[Array, NDArray[np.int64], slice]] = []
         self._products: dict[Powers, int] = {}
         self._scales: list[float] = []
@@ -603,7 +603,7 @@ class ParameterArrays:
         self._gathered_products: tuple[list[Powers], Array, NDArray[np.int64]] | None = None
 
     def array(self, exprs: Any) -> Array:
-        """Return the array of numbers that always stands for `exprs`; return `exprs` if it contains only numbers."""
+        """Return the array of numbers for `exprs`, always the same one; return `exprs` if it contains only numbers."""
         if exprs.dtype != object:
             return exprs  # type: ignore[no-any-return]
         if id(exprs) not in self._arrays:
@@ -628,7 +628,7 @@ class ParameterArrays:
         return numbers.reshape(exprs.shape)
 
     def write(self, product: Callable[[Powers], Any]) -> None:
-        """Store the values of all expressions in the arrays; `product`: result of TraceCache.product_evaluator."""
+        """Write values of all expressions to their arrays; `product`: result of TraceCache.product_evaluator."""
         if self._gathered_products is None:
             return
         products, scales, product_indices = self._gathered_products

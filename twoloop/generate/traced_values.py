@@ -33,10 +33,10 @@ N_NEARBY = 8  # before a run, calls and traces are compared at the start, and at
 RELATIVE_TIMES = np.linspace(0.0, 1.0, N_NEARBY)  # times of the random states, from 0 (start of the run) to 1 (its end)
 NEARBY_DISTANCE = 0.3  # largest distance of a random position from the start, relative to the sizes of the coordinates
 MAX_STATES_OF_CHUNK = 32  # a `Sample` takes at most about this number of states from one chunk of steps
-MAX_STATES = 64  # a comparison uses at most about this number of states, a `Sample` at most this number of chunks
+MAX_STATES = 64  # largest number (about) of states in a comparison; largest number of chunks with states in a `Sample`
 MAX_STATES_IN_PYTHON = 9  # replaces MAX_STATES if the callbacks are called in Python
 MAX_ENTRIES = 20_000  # fewer states are compared in large systems: (states) * (results per state) is about this at most
-# the scale of rounding errors of a callback: the largest bound of its rounding errors, divided by EPS (see checks.py)
+# the scale of a callback's rounding errors: the largest bound on errors of its results, divided by EPS (see checks.py)
 ROUNDING_DIFFERENCE = 16.0 * np.finfo(float).eps  # differences up to this * (scale of rounding errors) are harmless
 CLEAR_DIFFERENCE = 1e-6  # a trace is wrong if a difference exceeds this * (scale of rounding errors), or is systematic
 # `_is_systematic` compares call and trace at N_NEIGHBOURS states, at most PERTURBATION (relative) from a given state
@@ -169,7 +169,7 @@ class CallbackTraces:
 
 
 class Sample:
-    """States [t, q, v] of a run, not always all, for the comparison after the run; `n`: length of [q, v]."""
+    """States [t, q, v] of a run, all or some, at which calls and traces are compared later; `n`: length of [q, v]."""
 
     def __init__(self, t: float, state: Array, n: int) -> None:
         self._n, self._chunks = n, list[Array]()
@@ -215,7 +215,7 @@ Check = Callable[[CallbackTraces], None]  # function that compares traces with c
 
 
 def accept_traces(traced: CallbackTraces) -> None:
-    """Accept traces without a comparison: the `Check` for results that yield no motion, or that are compared later."""
+    """Accept traces without a comparison: the `Check` if no motion follows from them, or if they are compared later."""
 
 
 def states_near_start(t0: float, t1: float, q: Array, v: Array) -> Array:

@@ -35,7 +35,7 @@ from twoloop.kernels.data.indices import DEFECT_GAP, GAP, MAX_GAP_RATIO, N_COUNT
 from twoloop.kernels.evaluation.checks import CONSISTENT, DEFINITE, INDEFINITE, WELL_FORMED
 from twoloop.kernels.linalg.dense import copy
 
-ROUNDING = 1e-15  # rounding error of a position, relative to max|q|; if corrections are smaller, C_q is kept
+ROUNDING = 1e-15  # rounding error of a position, relative to max|q|; smaller corrections do not require a new C_q
 
 
 @merged
@@ -103,10 +103,10 @@ def _first_step_size(state, n, t, span, smallest):
 
 @exact
 def _set_step_limits(control, tolerances, t, t1, longest, within):
-    """Store the largest step size, and the longest times between evaluations of the equations and samples of forces.
+    """Store three limits: of the step size, of the time between evaluations, and of the time between samples of forces.
 
-    Evaluations are at most MAX_GAP_RATIO * (t1 - t) s apart, which also limits the step size. If the method adds
-    evaluations within long steps (`within` is True), only `longest` (s) limits the step size.
+    Evaluations (of the equations) are at most MAX_GAP_RATIO * (t1 - t) s apart, which also limits the step size. If the
+    method adds evaluations within long steps (`within` is True), only `longest` (s) limits the step size.
     """
     max_gap = max(MAX_GAP_RATIO * (t1 - t), MIN_GAP * np.spacing(max(abs(t), abs(t1))))
     tolerances[GAP], tolerances[DEFECT_GAP] = max_gap, max_gap / (GAP_RATIO if control[at.BY_STATE] > 0.0 else 1.0)
@@ -140,9 +140,8 @@ def split_steps(steps, counts, h, changes, used_newton):
     """Split `steps`, the records of steps (rows of out_steps, see loop_state.py), into arrays with one entry per step.
 
     `h` receives the step sizes (s), `used_newton` True for steps by Newton's method. The three rows of `changes` count
-    events since the previous step: rejections by the error test, failed steps, and new partitions.
-    On entry, `counts` contains how many of these events happened before the first step of `steps`, since the start of
-    the run; on return, how many happened until the last step.
+    events since the previous step: rejections by the error test, failed steps, and new partitions. `counts` contains
+    the numbers of these events since the start of the run: before the first step on entry, at the last one on return.
     """
     for k in range(h.size):
         h[k], used_newton[k] = steps[k, at.H], steps[k, at.JACOBIANS] > 0.0
@@ -195,23 +194,23 @@ RUN_ARRAYS.add_function("advance", i8(KIT, WORK, *(VECTOR,) * 9, MATRIX, MATRIX,
     WEAK_LIMIT,  # M counts as singular if the ratio of its smallest to its largest eigenvalue is below this
     ADDED_SCALE,  # factor s: for a singular M, generated code uses M + s g^T g instead, where g are some rows of G
     CONTRADICTS,  # a start is refused if a residual of G a = gamma exceeds this times max(1, sum of |terms| in the row)
-    MASS_FLAG,  # a start is refused unless the check of M returns this: DEFINITE, INDEFINITE, or 0 for a constant M
+    MASS_FLAG,  # a start is refused unless the check of M gives this, DEFINITE or INDEFINITE; 0: constant M, no check
     LEAST_PIVOT,  # a start is refused if the smallest pivot of C_q at the start is below this
     EQUATION_FORM,  # initial f.form, the algebra that solves for accelerations
     FIRST_SIZE,  # first step size (s) that the user has chosen; 0: it is computed
-    LEAST_DISTANCE,  # argument `smallest` of _first_step_size, the displacement that replaces a smaller max|q|
+    LEAST_DISTANCE,  # argument `smallest` of _first_step_size: displacement that is used there if max|q| is smaller
     LONGEST,  # longest step (s): argument `longest` of _set_step_limits
     EVALUATES_WITHIN,  # 1: the method adds evaluations within long steps; 0: it does not, which limits the step size
     NEAR_PIVOT,  # Python must check a run if, at an output time, (smallest / largest pivot of C_q) is below this
-    MAX_CHANGE_RATIO,  # velocities jump in a step if max|change| exceeds this * (step size) * max|a| at both ends
+    MAX_CHANGE_RATIO,  # velocities jump in a step if max|change| > this * (step size) * (smaller max|a| of both ends)
     MIN_SAMPLES,  # Python must check a run if sudden changes of a force, C_t or b are less than this many samples apart
 ) = range(18)
-# indices in `expected`, the choice of constraint rows for which code was generated (empty without generated code)
+# indices in `expected`, which lists the constraint rows that generated code uses (empty without generated code)
 (
-    BOUND,  # index of the pivot limit in MIN_PIVOTS (generate/elimination.py); OF_PYTHON: only Python can check pivots
+    BOUND,  # index of the pivot limit in MIN_PIVOTS (generate/elimination.py); OF_PYTHON: Python must choose the rows
     N_ROWS,  # number of independent rows
     N_ADDED,  # number of rows g that are added to a singular M as s g^T g
-    FIRST_ROW,  # index at which two lists begin: first the indices of independent rows, then those of the added rows g
+    FIRST_ROW,  # index where the list of independent rows begins; the list of rows g, added to M as s g^T g, follows
 ) = range(4)
 OF_PYTHON = 100
 
@@ -262,7 +261,7 @@ def _start_run(f, checked_kit, w, b, t, t1, q, v, records, checks):
     """Check and prepare the start of a run from t to t1; return 0 if the run may begin, else a code such as REFUSED.
 
     `checked_kit`: kit with the user's callbacks, which check the start (callbacks of `f` may be derived from them).
-    `checks`: what Python has checked, such as STATE_CHECKED. `records`: data of earlier positions (`evaluate_start`).
+    `checks`: what Python has checked, such as STATE_CHECKED. `records`: earlier positions, see `evaluate_start`.
     """
     n = q.size
     if not (finite_vector(q) and finite_vector(v)):
@@ -329,7 +328,8 @@ def _restore_start(b):
 
 N_EQUAL = 0  # last_start[N_EQUAL]: number of successive runs from the last start, counted up to 2
 START = 1  # last_start[START:]: the last start, [t, t1, q, v], where t1 is the end of the run
-NEVER, IS_SAVED = 0.0, 2.0  # if last_start[N_EQUAL] is NEVER, the last start is not reused; IS_SAVED: it is in `saved`
+# values of last_start[N_EQUAL]. NEVER: the last start must not be reused. IS_SAVED: its data are stored in b.saved
+NEVER, IS_SAVED = 0.0, 2.0
 
 
 @exact
@@ -356,7 +356,7 @@ def _equals_last_start(last_start, t, t1, q, v):
     LONGEST_GAP,  # longest time (s) between two evaluations of the equations
     END_CODE,  # code that `advance` returned
     IS_NEW,  # 1: the start differs from the start of the previous run; 0: both are equal
-    N_REPORT,  # index of the first counter (of steps, rejections, evaluations, ...)
+    N_REPORT,  # number of entries above; counters (of steps, rejections, evaluations, ...) begin at this index
 ) = range(11)
 N_HEAD = N_REPORT + N_COUNTERS  # length of the report with counters, without times and steps
 

@@ -45,7 +45,7 @@ Buffers = tuple[Array, Array, Array]  # arrays of times, states and records of s
 FIRST_CHUNK = 1024
 FIRST_CHUNK_IN_PYTHON = 64  # largest number of steps in the first chunk if callbacks are (slow) Python functions
 SMALL_SYSTEM = 32  # largest number of coordinates of a small system; chunks of larger ones are proportionally smaller
-TRIAL_STEPS = 10  # a method on trial is given up if one of this many first steps is short, see loop_state.TRIAL_STEPS
+TRIAL_STEPS = 10  # number of first steps in which a method on trial must propose sizes above tolerances[GAP]
 NO_PATTERN = np.zeros((0, 0))  # empty argument `pattern` for the fixed-order form, which stores the pattern itself
 # constraints contradict one another if a row of G a = Gamma is violated by more than this * max(sum of |terms|, 1)
 CONTRADICTION = 1e-6
@@ -124,12 +124,12 @@ class Run:
         self.piece_ends: list[float] = []  # end times (s) of next steps along a polynomial across a singular position
         self.origins: list[Any] = []  # `Origin` (begin, limits) of each polynomial still to be tried for a crossing
         self.t1 = np.inf  # end of the run (s)
-        self.starts_singular = False  # whether the start is a singular position: C_q has a higher rank beside it
+        self.starts_singular = False  # whether the start is a singular position: nearby, C_q has a higher rank
         self.branch_known = False  # whether it is known on which branch the motion leaves a singular start
         self.jumps: list[float] = []  # times (s) at which velocities jumped because C_t, or b in A v + b = 0, jumped
         self.compared_until = [-np.inf]  # latest time (s) of a comparison with traces; copies of the run share the list
         self.region: CheckedRegion | None = None  # where callbacks agreed with traces; None: the system's region
-        self.varied_parameters: Array | None = None  # parameter values now, if systems share this run; None: one system
+        self.varied_parameters: Array | None = None  # current parameters in a ParametricRun; None in other runs
         self._compute_start_accelerations()
         self.rank = len(self.work.rows_v)
         self.descriptions: dict[tuple[int, ...], str] = {}  # cached warnings; the keys are indices of redundant rows
@@ -401,8 +401,8 @@ class Run:
     def limit_steps(self) -> None:
         """Limit step sizes so that forces are evaluated at least every hundredth of the run, to detect short forces.
 
-        If forces may be steep, steps are at most a hundredth of the run, unless the method evaluates forces within its
-        steps: one evaluation alone may not detect a short force.
+        If forces may vary much within a step, steps are at most a hundredth of the run, unless the method evaluates
+        forces within its steps: one evaluation alone may not detect a short force.
         """
         gap = 1.0 if self.forces_may_be_steep else self.plan.max_gap
         max_size = np.inf if self.plan.evaluates_within else self.tolerances[indices.GAP] / gap
@@ -425,7 +425,7 @@ class Run:
 
         This is checked at output times, and at the ends of steps of fixed size.
         """
-        # pivots of the fixed-order form vary more: there, only a ratio below SMALL_PIVOT shows a singular position
+        # pivots of the fixed-order form differ more than those of other forms: min / max pivot has a smaller limit
         threshold = self.near_threshold if self.fixed_order is None else SMALL_PIVOT
         return bool(self.clock[self.a.PIVOT_AT_OUTPUT] < threshold)
 

@@ -24,12 +24,12 @@ Array = NDArray[np.float64]
 CHANGE_PER_SAMPLE = 3e-3  # finite differences in time use samples between which C_q changes by about this fraction
 # weights of five equidistant samples in finite differences; row 0: first derivative, row 1: second derivative
 WEIGHTS = np.array([[1.0, -8.0, 0.0, 8.0, -1.0], [-1.0, 16.0, -30.0, 16.0, -1.0]]) / 12.0
-# assumed relative error of finite differences: if a displacement of max|q| changes C_q less, dC_q/dt counts as zero
+# assumed relative error of finite differences: dC_q/dt counts as 0 if a displacement of max|q| changes C_q by less
 MAX_DIFFERENCE_ERROR = 1e-8
 # the rank of C_q rises along the motion if (ds/dt) / |dC_q/dt| exceeds this; s: a singular value, zero at the start
 MIN_RANK_DERIVATIVE = 1e-6
 # let s be a singular value of C_q that is zero at the start: ds/dt is certainly not zero if it exceeds this multiple of
-# its uncertainty, which is the norm of dC_q/dt for a velocity as large as the tolerances
+# the norm that dC_q/dt would have if the velocities were as large as the tolerances
 MIN_CLARITY = 10.0
 # a run begins beside its singular start, at a state where C_q has changed by the fraction BESIDE_CHANGE or less. Its
 # first step changes C_q by about the fraction STEP_CHANGE
@@ -113,7 +113,7 @@ def _branch_at(system: ConstrainedSystem, t: float, state: Array, rank: int, all
     force = null_space.T @ (units * system.force(t, q, v) - mass @ a)
     a += null_space @ np.linalg.solve(null_space.T @ mass @ null_space, force)
     a *= units
-    acceleration = 0.0  # part of d^2 C_q/dt^2 due to a, divided by the norm of C_q, 1/s^2
+    acceleration = 0.0  # |part of d^2 C_q/dt^2 due to a| / |C_q|, in 1/s^2
     if a.any():
         acceleration = float(np.linalg.norm(derivative_of_rows(a, distance / float(np.abs(a).max())))) / norm
     for change in BESIDE_CHANGE * 0.5 ** np.arange(N_BESIDE):

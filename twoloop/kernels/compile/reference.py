@@ -39,7 +39,7 @@ class Reference(types.Type):
 
     name : unique name of the type.
     arrays : type of each array, by name of its field; all arrays are contiguous, with one or two dimensions.
-    elements : by field of an array: {name: index}. In compiled code, `structure.name` is the element at this index.
+    elements : keys: fields of arrays. Values: {name: index}; in compiled code, `structure.name` is this array element.
     """
 
     def __init__(
@@ -53,7 +53,7 @@ class Reference(types.Type):
         self.elements = {element: (array, i) for array, named in elements.items() for element, i in named.items()}
         self.functions: dict[str, Signature] = {}
         self.llvm_functions: set[str] = set()  # fields in `functions` whose functions are generated as LLVM code
-        self.offsets: dict[str, int] = {}  # index of each field's address in the table; sizes of an array follow it
+        self.offsets: dict[str, int] = {}  # index of each field's address in the table; an array's sizes follow
         self.n_words = 0  # length of the table so far
         self._addresses: Any = BoundedCache()  # addresses of machine code, by the tuple of all functions of a structure
         for field, kind in self.arrays.items():

@@ -48,7 +48,7 @@ def newton_program(
 ) -> NDArray[np.int32] | None:
     """Return the program that factors Newton's matrix; None if the program would be too long.
 
-    `tangents`: entries of K and D (derivatives of forces), both triangles, in the order of `grouped_entries`. For the
+    `tangents`: entries of K and D (derivatives of forces), in both triangles, as sorted by `grouped_entries`. For the
     other arguments see `factorization_program`.
     """
     groups = column_groups(tangents, n_q)[tangents[1]]
@@ -60,7 +60,7 @@ def newton_program(
 
 
 def grouped_entries(tangents: Entries, n_q: int) -> Entries:
-    """Return `tangents`, the entries of K and D (derivatives of the forces), sorted by groups of columns."""
+    """Return `tangents`, the entries of K and D (derivatives of forces), sorted by the groups of `column_groups`."""
     sequence = np.argsort(column_groups(tangents, n_q)[tangents[1]], kind="stable")
     return tangents[0][sequence], tangents[1][sequence]
 
