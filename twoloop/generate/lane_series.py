@@ -220,7 +220,7 @@ class LaneSeries:
         ]
 
     def _row_expressions(self, sums: Sums, indices: Any) -> list[tuple[int, tuple[Terms, float]]]:
-        """Return pairs (i, (terms, constant)), one for each expression in `sums`; i, from `indices`: its equation."""
+        """Return (i, (terms, constant)) for each expression in `sums`; i: index of its equation, from `indices`."""
         return list(zip(indices.tolist(), self._expressions(sums, indices.tolist()), strict=True))
 
     def _make_operations(self, table: OperationGroups, quantity: int) -> list[Operation]:
@@ -383,8 +383,8 @@ class LaneSeries:
         """Write loops for sums over 1 < j < k, and return the sums: of X[j] Y[k - j], and of X[j] Y[k + 1 - j].
 
         Keys of the returned dict: ((index of X, index of Y), True for Y[k + 1 - j] or False for Y[k - j]). For these
-        indices of series X and Y see `_factor_index`. `_PartialSums` adds the terms j = 1 and j = k later: these need
-        coefficients that are computed after the loops. One loop computes several sums, to load factors once.
+        indices of series X and Y see `_factor_index`. `_PartialSums` adds the terms j = 1 and j = k later: these may
+        need coefficients that are computed after the loops. One loop computes several sums, to load factors once.
         """
         keys = [(pair, True) for pair in self.carried_pairs]
         pairs = {pair for each in (*self.early, *self.late) for pair in self._factors(each)}

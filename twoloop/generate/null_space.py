@@ -73,7 +73,7 @@ class Factors:
     def _inverse(self, pivots: list[list[Affine]], own_pivots: list[Any]) -> list[list[Affine]]:
         """Return the inverse of a 1x1 or 2x2 pivot block, and append its pivots to `mass_pivots` or `conditions`.
 
-        `own_pivots`: for each row, the pivot if G had no other rows; None: the row's pivot is added to `mass_pivots`.
+        `own_pivots`: for each row, the pivot if G had no other rows; None: its pivot is appended to `mass_pivots`.
         """
         diagonal = [None if pivot is None else pivot.as_term() for pivot in own_pivots]
         a = pivots[0][0]
@@ -156,7 +156,7 @@ def _order_rows(rows: list[dict[int, Affine]], n: int, pairs: Sequence[tuple[int
 
     The row with the fewest neighbours comes first (minimum degree); neighbours of a row are the columns of its nonzero
     entries. Two rows with the same neighbours form one tuple. A row of G (index `n` and later) is eliminated after the
-    coordinates in which it has nonzero entries. In a tie, the row with the shortest chain of divisions comes first.
+    coordinates in which it has nonzero entries. In a tie, the row that needs the fewest successive divisions is first.
     """
     neighbours = [set(row) - {i} for i, row in enumerate(rows)]
     waiting_for = [{j for j in neighbours[i] if j < n} if i >= n else set() for i in range(len(rows))]

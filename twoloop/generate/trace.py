@@ -561,7 +561,7 @@ def shared_cache(system: ConstrainedSystem) -> TraceCache:
 
 
 def trace_cache_of(system: ConstrainedSystem) -> TraceCache:
-    """Return the TraceCache of all systems with equal callbacks, sizes, constant parameters and parameter groups."""
+    """Return the TraceCache for systems with equal callbacks, sizes, constant parameters and groups of parameters."""
     parameters = system.parameters
     groups = _parameter_groups(parameters)
     fixed_parameters = parameters[groups == 0] + 0.0  # -0.0 becomes 0.0, so that keys with zeros are equal
@@ -595,7 +595,7 @@ class ParameterArrays:
     def __init__(self) -> None:
         # keys: id of an array of expressions. Values: its numbers, and the array, so that no other array gets this id
         self._arrays: dict[int, tuple[Any, Array]] = {}
-        # for each array (numbers, indices, slice): `write` stores values[slice] in numbers[indices], the varying entries
+        # for each array (numbers, indices, slice): `write` stores values[slice] in the varying numbers[indices]
         self._number_arrays: list[tuple[Array, NDArray[np.int64], slice]] = []
         self._products: dict[Powers, int] = {}
         self._scales: list[float] = []
@@ -603,7 +603,7 @@ class ParameterArrays:
         self._gathered_products: tuple[list[Powers], Array, NDArray[np.int64]] | None = None
 
     def array(self, exprs: Any) -> Array:
-        """Return the array of numbers for `exprs`, always the same one; return `exprs` if it contains only numbers."""
+        """Return the one array of numbers that stands for `exprs`; if `exprs` contains only numbers, return `exprs`."""
         if exprs.dtype != object:
             return exprs  # type: ignore[no-any-return]
         if id(exprs) not in self._arrays:
@@ -628,7 +628,7 @@ class ParameterArrays:
         return numbers.reshape(exprs.shape)
 
     def write(self, product: Callable[[Powers], Any]) -> None:
-        """Write values of all expressions to their arrays; `product`: result of TraceCache.product_evaluator."""
+        """Write values of expressions to the arrays of numbers; `product`: result of TraceCache.product_evaluator."""
         if self._gathered_products is None:
             return
         products, scales, product_indices = self._gathered_products

@@ -84,7 +84,7 @@ def _first_step_size(state, n, t, span, smallest):
     """Return the first step size (s): FIRST_STEP times the shortest time scale of the motion from `state` [q, v, a].
 
     The time scales are the run's duration `span` (s), the times in which v or a changes q by max(max|q|, `smallest`),
-    and the time in which a changes v by max|v|. The step has at least MIN_FIRST_STEP spacings of times at t.
+    and the time in which a changes v by max|v|. The step is at least MIN_FIRST_STEP floating-point spacings at t.
     """
     distance, speed, acceleration = smallest, 0.0, 0.0
     for j in range(n):
@@ -141,7 +141,7 @@ def split_steps(steps, counts, h, changes, used_newton):
 
     `h` receives the step sizes (s), `used_newton` True for steps by Newton's method. The three rows of `changes` count
     events since the previous step: rejections by the error test, failed steps, and new partitions. `counts` contains
-    the numbers of these events since the start of the run: before the first step on entry, at the last one on return.
+    the numbers of these events since the start of the run: on entry, before the first step; on return, after the last.
     """
     for k in range(h.size):
         h[k], used_newton[k] = steps[k, at.H], steps[k, at.JACOBIANS] > 0.0
@@ -197,7 +197,7 @@ RUN_ARRAYS.add_function("advance", i8(KIT, WORK, *(VECTOR,) * 9, MATRIX, MATRIX,
     MASS_FLAG,  # a start is refused unless the check of M gives this, DEFINITE or INDEFINITE; 0: constant M, no check
     LEAST_PIVOT,  # a start is refused if the smallest pivot of C_q at the start is below this
     EQUATION_FORM,  # initial f.form, the algebra that solves for accelerations
-    FIRST_SIZE,  # first step size (s) that the user has chosen; 0: it is computed
+    FIRST_SIZE,  # first step size (s) chosen by the user; 0: `_first_step_size` computes it
     LEAST_DISTANCE,  # argument `smallest` of _first_step_size: displacement that is used there if max|q| is smaller
     LONGEST,  # longest step (s): argument `longest` of _set_step_limits
     EVALUATES_WITHIN,  # 1: the method adds evaluations within long steps; 0: it does not, which limits the step size
@@ -207,7 +207,7 @@ RUN_ARRAYS.add_function("advance", i8(KIT, WORK, *(VECTOR,) * 9, MATRIX, MATRIX,
 ) = range(18)
 # indices in `expected`, which lists the constraint rows that generated code uses (empty without generated code)
 (
-    BOUND,  # index of the pivot limit in MIN_PIVOTS (generate/elimination.py); OF_PYTHON: Python must choose the rows
+    BOUND,  # index of the pivot limit in MIN_PIVOTS (generate/elimination.py), or OF_PYTHON if Python must choose rows
     N_ROWS,  # number of independent rows
     N_ADDED,  # number of rows g that are added to a singular M as s g^T g
     FIRST_ROW,  # index where the list of independent rows begins; the list of rows g, added to M as s g^T g, follows

@@ -45,8 +45,8 @@ Buffers = tuple[Array, Array, Array]  # arrays of times, states and records of s
 FIRST_CHUNK = 1024
 FIRST_CHUNK_IN_PYTHON = 64  # largest number of steps in the first chunk if callbacks are (slow) Python functions
 SMALL_SYSTEM = 32  # largest number of coordinates of a small system; chunks of larger ones are proportionally smaller
-TRIAL_STEPS = 10  # number of first steps in which a method on trial must propose sizes above tolerances[GAP]
-NO_PATTERN = np.zeros((0, 0))  # empty argument `pattern` for the fixed-order form, which stores the pattern itself
+TRIAL_STEPS = 10  # number of first steps in which a method on trial must propose step sizes above tolerances[GAP]
+NO_PATTERN = np.zeros((0, 0))  # empty argument `pattern` of `workspace`: a FixedOrderForm has its own pattern
 # constraints contradict one another if a row of G a = Gamma is violated by more than this * max(sum of |terms|, 1)
 CONTRADICTION = 1e-6
 
@@ -122,7 +122,7 @@ class Run:
         self.attempts_left = np.inf  # the search for a step across a singular position ends after so many failures
         self.crossing_size = 0.0  # size (s) of the last attempted step across a singular position
         self.piece_ends: list[float] = []  # end times (s) of next steps along a polynomial across a singular position
-        self.origins: list[Any] = []  # `Origin` (begin, limits) of each polynomial still to be tried for a crossing
+        self.origins: list[Any] = []  # for each polynomial to be tried for a crossing, its `Origin` (begin, limits)
         self.t1 = np.inf  # end of the run (s)
         self.starts_singular = False  # whether the start is a singular position: nearby, C_q has a higher rank
         self.branch_known = False  # whether it is known on which branch the motion leaves a singular start

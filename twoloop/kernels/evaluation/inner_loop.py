@@ -181,7 +181,7 @@ def _find_least_correction(f, w):
 
 @merged
 def _find_corrections(f, w, v):
-    """Correct v in place, but not q: store its correction in w.y. Return max|correction| of q, and of v."""
+    """Correct v in place, but not q: store the correction of q in w.y. Return max|correction| of q, and of v."""
     rows, n_c = w.rows_v, w.C.size
     row_residual(w, v, rows)
     for i in range(rows.size):

@@ -232,7 +232,7 @@ def _choose_order(options, memory, tolerances, trial, y, y1, d):
             memory[NEXT_ORDER] = k - 1
         return error, max(SAFETY * error ** (-1.0 / (k + 1)), MIN_STEP_FACTOR)
     factor = (STEP_SIZE_FACTOR * here) ** (-1.0 / (k + 1))
-    if memory[AGE] >= k:  # errors of other orders can be estimated after k + 1 steps of order k, this one too
+    if memory[AGE] >= k:  # errors of other orders can be estimated after k + 1 steps of order k, this step included
         lower, higher = (STEP_SIZE_FACTOR * below) ** (-1.0 / k), (STEP_SIZE_FACTOR * error_above) ** (-1.0 / (k + 2))
         if lower > max(factor, higher):
             memory[NEXT_ORDER] = k - 1

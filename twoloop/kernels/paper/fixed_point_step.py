@@ -92,7 +92,7 @@ def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
         )
         if code != DONE:
             return Attempt(code, np.inf, 0.0)
-        # use the errors of the half steps: that of the whole step does not count, because its end is discarded
+        # use the prediction errors of both half steps; that of the whole step does not count: its end is discarded
         prediction_error = max(prediction_error, prediction_error_mid)
         code, error = estimate_and_extrapolate(
             f, w, options[EXTRAPOLATION], options[INNER_TOL], t + h, tolerances, q, v, q_full, v_full, q1, v1
