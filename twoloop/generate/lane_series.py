@@ -52,7 +52,7 @@ class LaneEmitter(Emitter):
         return self.broadcast(self.builder.load(pointer, constant=True))
 
     def function(self, name: str, x: Value) -> Value:
-        """Compute the function `name` of x: by an LLVM intrinsic for all lanes, or else by a libm call in each lane."""
+        """Compute the function `name` of x: by an LLVM intrinsic if there is one, else by a libm call in each lane."""
         if name in INTRINSICS:
             return super().function(name, x)
         result, scalar = undefined(self.double_type), Emitter(self.builder)
@@ -156,7 +156,7 @@ MAX_SUMS_IN_LOOP = 12 if LANES == 8 else 6
 class Operation(NamedTuple):
     """Operation on Taylor series; the sine and the cosine of an angle are one operation with two results."""
 
-    kind: int  # such as PRODUCT, see kernels/evaluation/operations.py
+    kind: int  # kind of operation, such as PRODUCT, see kernels/evaluation/operations.py
     results: tuple[int, ...]  # indices of the results of this operation among all quantities
     first: tuple[Terms, float]  # terms and constant of the first argument
     second: tuple[Terms, float]  # terms and constant of the second argument

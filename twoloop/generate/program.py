@@ -123,7 +123,7 @@ class Program:
 class ArrayAlgebra(Algebra[Any]):
     """Algebra in which a value is an array (n_runs,), with one number for each run, or one number for all runs.
 
-    tape : record of how coefficients depend on parameters. parameters : their values, (n_runs, n_p).
+    tape : record of how coefficients depend on parameters. parameters : values of the parameters, (n_runs, n_p).
     """
 
     functions: Mapping[int, Callable[[Any], Any]] = MappingProxyType(

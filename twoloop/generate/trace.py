@@ -328,7 +328,7 @@ class Equations:
         return self._gamma(*GAMMA_SOURCES[kind], self.v if v is None else v)
 
     def _derive_or_trace(self, kind: str, v: Sequence[Affine]) -> Any:
-        """Return the trace of the callback `kind`; if the system does not have it, derive C_q and gamma from others."""
+        """Return the trace of the callback `kind`; if it is missing, derive C_q and gamma from other callbacks."""
         if self._is_derived(kind):
             return self.derivatives(kind, v)
         if kind in self._results_before_copy and v is self.v:

@@ -124,7 +124,7 @@ class CallbackTraces:
         else:
             is_agreeing |= ~finite
         largest = np.where(np.isfinite(bounds), bounds, 0.0).max(axis=0)
-        # for each entry, the scale of rounding errors of its callback is the largest bound of the callback's entries
+        # scale for each entry: the largest bound on the rounding errors of all entries of the same callback
         scales = np.repeat(np.maximum.reduceat(largest, np.cumsum(self.n_entries) - self.n_entries), self.n_entries)
         for k, entry in np.argwhere(~is_agreeing & ~(differences <= ROUNDING_DIFFERENCE * scales)):
             if not differences[k, entry] <= CLEAR_DIFFERENCE * scales[entry] or self._is_systematic(

@@ -334,7 +334,7 @@ NEVER, IS_SAVED = 0.0, 2.0
 
 @exact
 def _equals_last_start(last_start, t, t1, q, v):
-    """Return True if the start (t, t1, q, v) equals the last one bit for bit; store it as the last one."""
+    """Return True if the start (t, t1, q, v) equals the last start bit for bit; store it as the last start."""
     n, is_same = q.size, last_start[N_EQUAL] > NEVER
     for k in range(2 + 2 * n):
         x = t if k == 0 else t1 if k == 1 else q[k - 2] if k < 2 + n else v[k - 2 - n]

@@ -157,7 +157,7 @@ class Run:
         return new_run
 
     def restart(self, t: float, q: Array, v: Array) -> int:
-        """Begin anew at the state (q, v) at t, without the past steps; return DONE, or why accelerations failed."""
+        """Begin anew at the state (q, v) at t, without the past steps; return DONE or a failure code."""
         n, state = self.system.n_q, self.state
         state[:n], state[n : 2 * n], state[2 * n :] = q, v, 0.0
         self.plan.memory[:] = self.memory
@@ -409,7 +409,7 @@ class Run:
         self.control[self.a.MAX_STEP], self.control[self.a.MAX_EVALUATION_GAP] = min(self.max_step, max_size), gap
 
     def choose_first_step(self, t: float, t1: float, state: Array, longest: float = 0.0) -> float:
-        """Return the size (s) of the first step from a state; if `longest` > 0 (max_step), store limits of sizes."""
+        """Return the size (s) of the first step from a state; if `longest` (max_step) > 0, also store step limits."""
         numbers = self.system.n_q, t, t1, self.least_atol, longest, self.plan.evaluates_within
         size: float = entry_point(cached_run().first_step_and_limits)(self.control, self.tolerances, state, *numbers)
         return size

@@ -71,7 +71,7 @@ def column_groups(entries: Entries, n_q: int) -> Integers:
     for i, j in zip(*(indices.tolist() for indices in entries), strict=True):
         rows_of[j].append(i)
     groups = np.zeros(n_q, dtype=np.int64)
-    groups_by_row: list[set[int]] = [set() for _ in range(n_q)]  # for each row: groups of columns with entries there
+    groups_by_row: list[set[int]] = [set() for _ in range(n_q)]  # for each row: groups of columns with entries in it
     for j, rows in enumerate(rows_of):
         groups_in_rows = set().union(*(groups_by_row[i] for i in rows))
         groups[j] = group = next(k for k in range(n_q) if k not in groups_in_rows)
