@@ -215,7 +215,7 @@ class Quantities:
         return loaded[quantity]
 
     def mark_stored(self, quantity: int) -> None:
-        """Note that a quantity was stored: later parts of a split function load it, to need fewer registers."""
+        """Record that a quantity was stored: then later parts of a split function load it, and need fewer registers."""
         self._loaded_in_part()[quantity] = self._values.pop(quantity)
 
     def _loaded_in_part(self) -> dict[int, Value]:
@@ -378,7 +378,7 @@ class Lowering(Algebra[Value]):
         return None
 
     def run_program(self, program: Program) -> list[list[Value]]:
-        """Write code that computes the arrays of a program, and the quantities in its conditions; return the arrays.
+        """Write code for the arrays of a program and the quantities on which their validity depends; return the arrays.
 
         If the function is split into parts, each number is computed right before its use, so that few numbers have to
         be kept from one part to the next; LLVM reorders instructions only within a part.
@@ -399,7 +399,7 @@ class Lowering(Algebra[Value]):
         return [self.affine(expr) for expr in exprs]
 
     def is_valid(self, program: Program, values: Sequence[Value]) -> Value:
-        """Return a flag: 1 if the program's conditions hold, `values` are finite, and |angles| < LARGEST_ANGLE."""
+        """Return 1 if all `conditions` of a program hold, `values` are finite, and |angles| < LARGEST_ANGLE, else 0."""
         emit, builder, zero = self.emit, self.emit.builder, self.emit.constant(0.0)
         total = zero
         for value in values:  # values that are not finite make the sum NaN

@@ -31,7 +31,7 @@ MAX_REPETITIONS = 2  # largest number of repetitions of a run that may have miss
 
 
 def may_have_missed_changes(run: Run, limit: float = REPEAT_BELOW) -> bool:
-    """Return whether the shortest change of forces is below `limit` times the longest time between evaluations."""
+    """Return whether the shortest change of forces is shorter than `limit` * (longest time between evaluations)."""
     a, clock = run.a, run.clock
     return bool(clock[a.SHORTEST_CHANGE] < limit * clock[a.WIDEST_SAMPLING])
 
@@ -91,9 +91,9 @@ def corrected_positions(system: ConstrainedSystem, t: float, q: Array) -> Array:
 
 
 def scaled_equations(system: ConstrainedSystem, t: float, q: Array) -> tuple[Array, Array]:
-    """Return the matrix K = [M G^T; G 0] in other units, and these units (n_q + n_rows,), see `units_of_equations`.
+    """Return the scaled matrix U K U of K = [M G^T; G 0], and the diagonal of U, see `units_of_equations`.
 
-    The solution x of K x = r is then units * y, where y is the solution of (scaled K) y = units * r.
+    U is diagonal, with n_q + n_rows entries. The solution x of K x = r is U y, where y solves (U K U) y = U r.
     """
     mass, rows = system.mass(t, q), system.rows(t, q)
     units = units_of_equations(mass, rows)
@@ -108,7 +108,7 @@ def units_of_equations(mass: Array, rows: Array) -> Array:
     """
     inertia, is_coupled, is_linked = np.abs(np.diagonal(mass)), mass != 0.0, rows != 0.0
     # coordinates that M couples share their largest inertia: of a body's Euler parameters, one may have nearly none. A
-    # coordinate without inertia that M couples with no other takes the least inertia of coordinates in its rows of G
+    # coordinate without inertia that M couples with no other takes the least inertia of those in the same rows of G
     has_others = is_coupled.sum(axis=1) > (inertia > 0.0)
     inertia = np.where(has_others, (is_coupled * inertia).max(axis=1), inertia)
     known = np.where(inertia > 0.0, inertia, np.inf)
@@ -135,12 +135,12 @@ FAR_BEFORE = 0.2
 # if no step across a singular position succeeds, the tolerances are multiplied by TOLERANCE_FACTOR, and the longest
 # allowed time between evaluations by GAP_FACTOR (if no forces are short, this time becomes unlimited)
 TOLERANCE_FACTOR, GAP_FACTOR = 10.0, 4.0
-MAX_ATTEMPTS_IN_PYTHON = 200  # largest number of failed steps across a position if Python evaluates the equations
+MAX_ATTEMPTS_IN_PYTHON = 200  # largest number of failed steps across a singular position if callbacks run in Python
 NODE_DISTANCES = 1.0, 0.5, 0.25  # values that are tried in turn for the field `node_distance` of Limits
 
 
 class Limits(NamedTuple):
-    """Limits of a polynomial across a singular position and of its steps; if no step succeeds, wider ones are tried."""
+    """Limits of steps across a singular position and of their polynomial; if no step succeeds, wider ones are tried."""
 
     has_wide_gaps: bool  # whether the longest allowed time between evaluations is multiplied by GAP_FACTOR
     may_approach: bool  # whether a step may end before the singular position, but nearer to it than the step began
@@ -159,8 +159,8 @@ class Origin(NamedTuple):
     may_end_beyond: bool = False  # whether the polynomial may end beyond the end of the run
 
 
-# the search for a state at which the polynomial begins goes back in time. It stops at a state whose distance is less
-# than this fraction of the largest distance found: another singular position is near that state
+# the search for a state at which the polynomial begins goes back in time. It stops near another singular position: at
+# a state whose distance (see FAR_BEFORE) is less than this fraction of the largest distance found before
 MIN_DISTANCE_RATIO = 0.5
 
 

@@ -33,9 +33,9 @@ from twoloop.run.singular_start import branch_at
 
 Array = NDArray[np.float64]
 
-MAX_ATTEMPTS = 1024  # after this many attempted integration steps in one sample, `IntegrationLoop` takes over
+MAX_ATTEMPTS = 1024  # after this many attempted steps from one sampling time to the next, `IntegrationLoop` takes over
 FORCE_KINDS = {"force", "force_by_q", "force_by_v"}  # parameters that change may enter these callbacks only
-CHANGED_PARAMETERS = "the parameters changed at samples"  # `changes` in each Result of a SampledRun
+CHANGED_PARAMETERS = "the parameters changed at samples"  # value of `Result.changes` of a SampledRun
 
 
 class SampledState(NamedTuple):
@@ -121,7 +121,7 @@ class SampledRun:
                 f"have lost rank there ({dependent_rows(self._derived_system, t, q)}), but not beside it. Start a "
                 "little before that position, or beyond; run and solve_dae may start there"
             )
-        run.work.notes[indices.GENERATION] = 1.0  # as if a partition had been chosen: ranks are known
+        run.work.notes[indices.GENERATION] = 1.0  # number of partitions; above 0, kernels use the run's ranks
         run.set_step_sizes(None, self.max_step, t + 1.0)
         run.control[run.a.STORE_ALL] = 0.0
         return run
@@ -168,7 +168,7 @@ class SampledRun:
         return self.state
 
     def _step_to(self, end: float) -> None:
-        """Integrate to the time `end`; if short changes may have been missed, integrate again with denser samples."""
+        """Integrate to `end`; if short changes of forces may have been missed, integrate again with more samples."""
         for _ in range(MAX_REPETITIONS):
             self._integrate_to(end)
             if not may_have_missed_changes(self.run):

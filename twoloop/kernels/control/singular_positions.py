@@ -20,7 +20,7 @@ SHRINKAGE = 0.8  # if a step with projected stages is rejected or fails, it is r
 MIN_STEP_NEAR_SINGULAR = 0.001  # shortest useful step near a singular position, relative to the longest recent step
 # if no crossing can be attempted, the run ends when the smallest pivot is below this fraction of its maximum in the run
 UNDETERMINED_PIVOT = 1e-6
-CHECK_INTERVAL = 16  # number of steps between checks of the partition if generated code runs, which needs no partition
+CHECK_INTERVAL = 16  # the partition, which generated code does not use, is checked once in this many of its steps
 # in the augmented form, with n degrees of freedom, the partition is checked every 1 + n // FREEDOMS_PER_CHECK steps,
 # because each check computes the null space of [C_q; A], a dense matrix that steps in this form do not need
 FREEDOMS_PER_CHECK = 32
@@ -91,7 +91,7 @@ def prepare_projected_repetition(f, w, control, clock, size):
 
 @merged
 def near_pivot_ratio(tolerances):
-    """Return the part of clock[LARGEST_PIVOT] below which pivots let rounding errors exceed MAX_ROUNDING_ERROR."""
+    """Return the ratio pivot / clock[LARGEST_PIVOT] below which rounding errors may exceed MAX_ROUNDING_ERROR."""
     return min(max(MIN_NEAR_RATIO, (EPS / (MAX_ROUNDING_ERROR * tolerances[LEAST])) ** (1.0 / 3.0)), MAX_NEAR_RATIO)
 
 
@@ -198,7 +198,7 @@ def check_partition(f, w, control, clock, size, at_output, state):
         if w.pivot < SINGULAR_PIVOT * clock[at.LARGEST_PIVOT]:
             w.nearly_singular = w.near_now = 1.0
     if short and size < MIN_STEP_NEAR_SINGULAR * clock[at.H_LONG] and w.nearly_singular == 1.0:
-        # steps of an implicit method may be this short because its partition was chosen at a distant state: renew it
+        # renew the partition: if it was chosen at a distant state, steps of an implicit method may become too short
         if renew_partition(f, w, clock[at.T], state[:n]) != DONE:
             return at.RANK_LOST
         if control[at.MAY_CROSS] != 1.0 and w.pivot < UNDETERMINED_PIVOT * clock[at.LARGEST_PIVOT]:

@@ -63,8 +63,8 @@ class Work(NamedTuple):
     G_of_S: Any  # (n_c + n_a, n_q) if M is constant: the G for which S and W were computed; NaN: S and W are invalid
     pattern: Any  # (n_c + n_a, n_q) 1 for entries of the constraint Jacobian that have been nonzero in the run, else 0
     mass_pattern: Any  # (n_q, n_q) 1 for entries of M that have been nonzero, else 0; only in the form AUGMENTED
-    row_entries: Any  # for each row of G, index in this array at which its list of nonzero columns begins; lists follow
-    Gamma_tried: Any  # (2, n_c + n_a) Gamma by differences: row 0 with 2 * time step, row 1 with the previous time step
+    row_entries: Any  # for each row of G, where its list of nonzero columns begins in this array; then these lists
+    Gamma_tried: Any  # (2, n_c + n_a) Gamma by differences: row 0 with time step 2 e, row 1 with the e tried before
     rates: Any  # (13, n_c + n_a) constraint rates C_t and b at 13 times within a step, see discontinuities.py
     changes: Any  # (N_CHANGES, n_q + n_c + n_a) samples of forces and constraint rates, see discontinuities.py
     Q: Any  # (n_q) generalized forces
@@ -103,7 +103,7 @@ class Work(NamedTuple):
     jacobian_values: Any  # nonzero entries of C_q, in the order of linalg/symbolic_factorization.py
     is_independent: Any  # (n_c) 1 for independent rows of C_q, 0 for redundant rows
     factors: Any  # factors of the augmented matrix; f.ldl_program contains the index of each entry
-    pivot_sizes: Any  # (n_q + n_c) squared norms of rows, to which the pivots are compared, see linalg/sparse_ldl.py
+    pivot_sizes: Any  # (n_q + n_c) squared norms of rows of C_q, to which pivots are compared, see linalg/sparse_ldl.py
     unknowns: Any  # (n_q + n_c) right-hand side when a solver is called, solution when it returns
     solutions: Any  # (3 (n_q + n_c)) scratch; then (n_c) a number s for each row g of C_q: s g^T g is added to M
 
@@ -189,7 +189,7 @@ KIT.add_function("attempt_many", MANY)
 # a boolean result return False, and write no results, if the code is not valid at this state, as pivots are too small
 OWN_FUNCTIONS = {
     # functions of a state: arguments (t, q, v, f.numbers), then the arrays of results that the comments name
-    "own_accelerate": types.boolean(f8, VECTOR, VECTOR, VECTOR, VECTOR),  # store accelerations
+    "own_accelerate": types.boolean(f8, VECTOR, VECTOR, VECTOR, VECTOR),  # store accelerations; False: code not valid
     "own_correct_positions": types.boolean(f8, VECTOR, VECTOR, VECTOR, VECTOR, VECTOR),  # store change of q and new q
     "own_project": types.boolean(f8, *[VECTOR] * 8),  # store accelerations, change of q, new q, new v, multipliers
     "own_redundant": types.boolean(f8, VECTOR, VECTOR, VECTOR, VECTOR),  # return True if redundant rows are satisfied
@@ -233,7 +233,7 @@ def _imported_modules(text: str) -> set[str]:
 
 @cache
 def source_digest(module: str) -> str:
-    """Return a hash of all sources on which the machine code of a module depends: part of its key in the cache on disk.
+    """Return a hash of all sources on which a module's machine code depends, for the key of this code on disk.
 
     These are the source of `module` (a name below twoloop.kernels, such as "steps.stages"), the sources of all modules
     that it imports, directly or not, and the signatures of callbacks.
@@ -307,7 +307,7 @@ class Kit:
     `functions`: callbacks and data of the system. `own`: functions generated for the mechanism, if any. `inner`: the
     inner loop, which may call `own`. `general`: the inner loop for any mechanism, for what generated code cannot do.
     `step`: functions of the method, or None if no kernel calls them. `first`, `second`: functions of two methods
-    between which the run may switch. `numbers`, `own_numbers`: data of generated functions of states, collocation.
+    between which the run may switch. `numbers`: data of generated functions of a state; `own_numbers`: of collocation.
     """
 
     def __init__(

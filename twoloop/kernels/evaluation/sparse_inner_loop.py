@@ -66,7 +66,7 @@ from twoloop.kernels.linalg.symbolic_factorization import (
 )
 
 # in the metric of M^-1, pivot / (squared norm of a row of C_q) is sin^2 of the row's angle to the span of previous rows
-SUSPECT_PIVOT = 1e-6  # up to this squared sine of a row's angle, a pivot may be a rounding error: the row is checked
+SUSPECT_PIVOT = 1e-6  # rows are checked if pivot / (squared norm of the row) is at most this, maybe a rounding error
 MIN_PIVOT = 1e-10  # factors are accurate if pivot / (squared norm of the row) exceeds this for all independent rows
 MAX_DEPENDENT_SINE = 1e-11  # a row is redundant if the sine of its angle to the independent rows' span is at most this
 PROJECT_STAGES = 2.0  # value of w.nearly_singular with which stages are projected before they are evaluated
@@ -293,7 +293,7 @@ def _fill_least_norm_matrix(program, jacobian, n_q, weights, values):
 
 @compiled
 def _fill_residual(program, jacobian, force, x, r):
-    """Store in r the residual of the equations for the multipliers of least norm; return its relative size.
+    """Store in r the residual of the equations for multipliers of least norm; return its size relative to reactions.
 
     See the module docstring: the residual is [p - G^T lam, lam - G y], its relative size max|p - G^T lam| / max|p|.
     x: approximate solution [y, lam]. p (`force`): reactions that lam must have. `jacobian`: entries of C_q = G.
@@ -506,7 +506,7 @@ def _check_redundant_rows(f, w, t, q, v):
 
 @compiled
 def _do_task_between_evaluations(f, w, task, t, q, v, a, lam):
-    """Do a task that neither evaluates nor projects; return a code: NEEDS_DENSE if only dense forms have this task."""
+    """Do a task from FIND_NULL_SPACE on, see tasks.py; return a code: NEEDS_DENSE if only dense forms can do it."""
     if task == tasks.FIND_NULL_SPACE:
         return factor_equations_at(f, w, t, q)
     if task == tasks.RENEW_PARTITION:

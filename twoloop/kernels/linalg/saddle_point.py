@@ -241,8 +241,8 @@ def solve_by_schur_complement(f, w, r, c, a):
             a[j] -= M_inverse_G[i, j] * w.z[i]
 
 
-# the augmented form needs at least MIN_ROWS constraints (measured: it is fastest from 7 on), and as many degrees of
-# freedom. If M is not diagonal, MIN_COORDINATES coordinates suffice in place of these (measured: fastest from about 30)
+# the augmented form is used with at least MIN_ROWS constraints (measured: fastest from 7 on) and at least MIN_ROWS
+# degrees of freedom. If M is not diagonal, fewer suffice with MIN_COORDINATES coordinates (measured: from about 30)
 MIN_ROWS = 8
 MIN_COORDINATES = 32
 

@@ -153,7 +153,7 @@ def _solve_collocation(f, w, options, data, tolerances, t, h, state):
         max_factor = min(max_factor, factor_by_defect)
     max_factor = min(max_factor, h_max / h)
     extra_sweeps = data[field.SWEEPS] - data[field.N_TARGET]
-    # the motion may be stiff if accelerations hardly vary, but sweeps are at most one fewer than intended (N_TARGET)
+    # the motion may be stiff if accelerations hardly vary, although the step took N_TARGET - 1 sweeps or more
     is_limited = data[field.CURVATURE] < MIN_CURVATURE and extra_sweeps >= -1.0
     data[field.LIMITED] = max(0.0, data[field.LIMITED] + (1.0 if is_limited else -1.0))
     # `trend`: ratio of the step sizes that the errors of this and of the last step allow. A trend below 1 probably
@@ -347,7 +347,7 @@ def _take_steps(f, w, options, data, tolerances, control, clock, goal, state, n_
         out_t[n_ends], out_steps[n_ends, at.H] = t, h
         data[field.DEFECTS + n_ends] = data[field.DEFECT]
         copy(state[: 2 * n], out_state[n_ends, : 2 * n])
-        # if this step was shortened to end at `goal`, the next one may have the size that this one should have had
+        # if this step was shortened to end at `goal`, the next step may have the intended size, `h_wanted`
         clock[at.H_NEXT] = max(h * factor, h_wanted) if h < h_wanted else h * factor
         n_ends += 1
     return n_ends
