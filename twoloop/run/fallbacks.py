@@ -108,7 +108,7 @@ def units_of_equations(mass: Array, rows: Array) -> Array:
     """
     inertia, is_coupled, is_linked = np.abs(np.diagonal(mass)), mass != 0.0, rows != 0.0
     # coordinates that M couples share their largest inertia: of a body's Euler parameters, one may have nearly none. A
-    # coordinate without inertia that M couples with no other takes the least inertia of those in the same rows of G
+    # coordinate without inertia that M couples with no other takes the least inertia of others in the same rows of G
     has_others = is_coupled.sum(axis=1) > (inertia > 0.0)
     inertia = np.where(has_others, (is_coupled * inertia).max(axis=1), inertia)
     known = np.where(inertia > 0.0, inertia, np.inf)

@@ -277,7 +277,7 @@ def _value_and_items(location: FrozenValue, seen: set[int]) -> Iterator[FrozenVa
     seen.add(id(location.value))
     fields = getattr(location.value, "_fields", None)
     for k, value in enumerate(location.value):
-        if isinstance(value, (tuple, np.ndarray, np.void)) or callable(value):  # numbers, for example, cannot change
+        if isinstance(value, (tuple, np.ndarray, np.void)) or callable(value):  # skip numbers etc., which cannot change
             name = f"{location.name}[{k}]" if fields is None else f"{location.name}.{fields[k]}"
             yield from _value_and_items(FrozenValue(None, "", name, value), seen)
 
@@ -345,7 +345,7 @@ class FunctionCopier:
         self.copies: dict[Any, Any] = {}  # replacements, by id of the original
 
     def replacement_of(self, value: Any, names: frozenset[str] = frozenset()) -> Any:
-        """Return `value`, or its copy with replaced helpers: a helper, a tuple or a module (its attributes `names`)."""
+        """Return `value` with helpers replaced if it is a helper, a tuple or a module (attributes `names` only)."""
         if self.is_copied(value):
             if id(value) not in self.copies:
                 self._add_copy(value)

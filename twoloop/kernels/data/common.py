@@ -64,7 +64,7 @@ class Work(NamedTuple):
     pattern: Any  # (n_c + n_a, n_q) 1 for entries of the constraint Jacobian that have been nonzero in the run, else 0
     mass_pattern: Any  # (n_q, n_q) 1 for entries of M that have been nonzero, else 0; only in the form AUGMENTED
     row_entries: Any  # for each row of G, where its list of nonzero columns begins in this array; then these lists
-    Gamma_tried: Any  # (2, n_c + n_a) Gamma by differences: row 0 with time step 2 e, row 1 with the e tried before
+    Gamma_tried: Any  # (2, n_c + n_a) Gamma by differences: row 0 with doubled time step, row 1 with the last one tried
     rates: Any  # (13, n_c + n_a) constraint rates C_t and b at 13 times within a step, see discontinuities.py
     changes: Any  # (N_CHANGES, n_q + n_c + n_a) samples of forces and constraint rates, see discontinuities.py
     Q: Any  # (n_q) generalized forces

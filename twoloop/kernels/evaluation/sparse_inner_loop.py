@@ -66,7 +66,7 @@ from twoloop.kernels.linalg.symbolic_factorization import (
 )
 
 # in the metric of M^-1, pivot / (squared norm of a row of C_q) is sin^2 of the row's angle to the span of previous rows
-SUSPECT_PIVOT = 1e-6  # rows are checked if pivot / (squared norm of the row) is at most this, maybe a rounding error
+SUSPECT_PIVOT = 1e-6  # a pivot up to this * (squared norm of its row) may be a rounding error: the row is checked
 MIN_PIVOT = 1e-10  # factors are accurate if pivot / (squared norm of the row) exceeds this for all independent rows
 MAX_DEPENDENT_SINE = 1e-11  # a row is redundant if the sine of its angle to the independent rows' span is at most this
 PROJECT_STAGES = 2.0  # value of w.nearly_singular with which stages are projected before they are evaluated

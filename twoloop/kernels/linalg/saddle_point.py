@@ -242,7 +242,7 @@ def solve_by_schur_complement(f, w, r, c, a):
 
 
 # the augmented form is used with at least MIN_ROWS constraints (measured: fastest from 7 on) and at least MIN_ROWS
-# degrees of freedom. If M is not diagonal, fewer suffice with MIN_COORDINATES coordinates (measured: from about 30)
+# degrees of freedom. If M is not diagonal, fewer suffice with MIN_COORDINATES coordinates or more (measured: about 30)
 MIN_ROWS = 8
 MIN_COORDINATES = 32
 

@@ -153,7 +153,7 @@ def _solve_collocation(f, w, options, data, tolerances, t, h, state):
         max_factor = min(max_factor, factor_by_defect)
     max_factor = min(max_factor, h_max / h)
     extra_sweeps = data[field.SWEEPS] - data[field.N_TARGET]
-    # the motion may be stiff if accelerations hardly vary, although the step took N_TARGET - 1 sweeps or more
+    # the motion may be stiff if accelerations hardly vary, although a step took at least (target number) - 1 sweeps
     is_limited = data[field.CURVATURE] < MIN_CURVATURE and extra_sweeps >= -1.0
     data[field.LIMITED] = max(0.0, data[field.LIMITED] + (1.0 if is_limited else -1.0))
     # `trend`: ratio of the step sizes that the errors of this and of the last step allow. A trend below 1 probably
