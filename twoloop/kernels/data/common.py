@@ -410,7 +410,7 @@ TINY = 1e-300  # smallest result of `smallest_size`, which avoids divisions by z
 
 @merged
 def smallest_size(tolerances):
-    """Return the size that smaller coordinates and velocities count as: the smallest atol / rtol, at most 1."""
+    """Return the size as which smaller coordinates and velocities count: the smallest atol / rtol, at most 1."""
     size = 1.0
     if tolerances[RTOL] > 0.0:
         for k in range(ATOL, tolerances.size):

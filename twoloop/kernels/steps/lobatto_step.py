@@ -74,7 +74,7 @@ CHECKED_GAP = 0.0908  # (longest time between evaluations) / (step size), if the
 N_EARLY, GROWTH_EARLY, GROWTH = 6, 4.0, 1.3
 GROWTH_ONE_SWEEP = 30.0  # largest ratio of step sizes early in a run, after a step that took only one sweep
 MIN_FACTOR = 0.4  # smallest ratio of the next step size to the size of an accepted step
-LEAST_TREND = 0.4  # lower limit of `trend`, the ratio of the step sizes that the errors of this and the last step allow
+LEAST_TREND = 0.4  # lower limit of `trend`, the ratio of the step sizes that the errors of two successive steps allow
 GAIN_BY_REPEATS = 1.5  # (step size that converges with two evaluations of accelerations per sweep) / (size with one)
 # sweeps stop evaluating accelerations twice (REPEATS = 0) if the convergence allows steps this many times as long as
 # the error estimate allows: the second evaluation then saves no time
@@ -156,7 +156,7 @@ def _solve_collocation(f, w, options, data, tolerances, t, h, state):
     # the motion may be stiff if accelerations hardly vary, although a step took at least (target number) - 1 sweeps
     is_limited = data[field.CURVATURE] < MIN_CURVATURE and extra_sweeps >= -1.0
     data[field.LIMITED] = max(0.0, data[field.LIMITED] + (1.0 if is_limited else -1.0))
-    # `trend`: ratio of the step sizes that the errors of this and of the last step allow. A trend below 1 probably
+    # `trend`: ratio of the step sizes that the errors of this and the previous step allow. A trend below 1 probably
     # continues, so the next step size is multiplied by the trend
     h_allowed = h * min(data[field.FACTOR_OF_ERROR], MAX_EXTRAPOLATION)
     if error > 1e-6 and data[field.CURVATURE] >= MIN_CURVATURE:
