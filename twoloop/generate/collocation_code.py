@@ -135,8 +135,8 @@ TARGET_SWEEPS = 6.0  # number of sweeps (iterations) in which a step should conv
 EXTRA_SWEEPS = 7  # a step is rejected if it has not converged after the target number of sweeps and this number more
 MAX_CONTRACTION = 0.8  # if changes by successive sweeps have at least this ratio in sweep 4 or later, reject the step
 MIN_RHO, MAX_RHO = 1e-3, 0.9  # the ratio rho of changes by successive sweeps is clipped to these bounds
-FAST_START, SLOW_START = 0.04, 0.3  # keep a guessed step size if changes by sweeps 2 and 1 have a ratio between these
-STAGNATION_RATIO = 0.5  # sweeps also end if a change may be a rounding error, and is at least this * the change before
+FAST_START, SLOW_START = 0.04, 0.3  # keep a guessed step size if change by sweep 2 / change by sweep 1 is in this range
+STAGNATION_RATIO = 0.5  # sweeps also end if a change of rounding size is at least this * the change by the sweep before
 # with steps of fixed size, sweeps (iterations) end if the error of the iteration is at most KAPPA_OF_FIXED * tolerance,
 # if changes are below ROUNDING_OF_FIXED * |v| (v: velocities) and decay no more, or after MAX_SWEEPS_OF_FIXED
 KAPPA_OF_FIXED, ROUNDING_OF_FIXED, MAX_SWEEPS_OF_FIXED = 1e-16, 1e-9, 60.0
@@ -185,7 +185,7 @@ class CollocationCode:
 
         if self.split_functions is None:
             programs = [*self.equations.accelerations, self.equations.position_projection, self.equations.projection]
-        else:  # if equations are split into functions, `shared.digest` covers all programs except the first one
+        else:  # the equations are split into functions, which `shared.digest` covers
             programs = self.equations.accelerations[:1]
         numbers = self.numbers
         description = [[each.sizes, *numbers.structure(each)] for each in programs]
@@ -449,8 +449,8 @@ class CollocationCode:
     def _repeated(self, emit: LaneEmitter, work: Value, state: Value) -> Iterator[list[Value]]:
         """Return a context manager: the code of its block runs once in a sweep, or twice if the field REPEATS is 1.
 
-        The code computes accelerations from velocities that the context manager yields. The first pass uses the
-        velocities of the previous sweep; the second integrates the accelerations of the first, to save sweeps.
+        The code computes accelerations from velocities that the context manager yields. First, these are the
+        velocities of the previous sweep. If the code runs again, they are integrals of the accelerations just computed.
         """
         builder, num, first_offset = emit.builder, Emitter(emit.builder), integer(self.v_offset)
         before, loop, repeat, after = builder.block, *(builder.append_block() for _ in range(3))
@@ -467,7 +467,7 @@ class CollocationCode:
             v0, a0 = (num.load(num.pointer(state, i), m * self.n) for m in (1, 2))
             of_v = self._weighted_accelerations(emit, tables().velocities, a0, work, i)
             store_lanes(emit, emit.fma(h, of_v, emit.broadcast(v0)), num.pointer(work, k * LANES), self.spectrum_offset)
-        offset.add_incoming(integer(self.spectrum_offset), builder.block)  # offset of the velocities in the second pass
+        offset.add_incoming(integer(self.spectrum_offset), builder.block)  # velocities for the second run of the block
         builder.jump(loop)
         builder.position_at_end(after)
 
@@ -665,7 +665,7 @@ class CollocationCode:
     def _project_in_parts(
         self, emit: LaneEmitter, work: Value, numbers: Value, write: Callable[..., Value], names: tuple[str, ...]
     ) -> None:
-        """Do the same as `_project` if equations are split into functions; `write` writes calls of these functions."""
+        """Write the code of `_project` for equations split into functions; `write` writes calls of these functions."""
         num, moved = Emitter(emit.builder), emit.builder.allocate(DOUBLE, LANES * self.n)
         indices = {name: num.pointer(work, index) for name, index in self._end_offsets().items()} | {"moved": moved}
         state = load_lanes(emit, work, self.end_offset), indices["q"], indices["v"]
@@ -777,7 +777,7 @@ def _compile(shared: SharedCode) -> Collocation:
         module = Module(splits_blocks=is_split)
         for name, emit in writers.items():
             llvm_code.write(module, name, KIT.llvm_signature(name), emit, partial(LaneEmitter, lanes=LANES))
-        # all coefficients were known before writing: else the functions would read beyond the end of their array
+        # writing must not add coefficients: the functions would read them beyond the end of their array
         assert len(code.numbers.values) == len(numbers)
         return list(writers), str(module)
 

@@ -24,9 +24,9 @@ from twoloop.kernels.evaluation import operations as op
 
 # derived callbacks and Taylor series with more operations are not generated: to trace these takes longer than most runs
 MAX_TRACED_OPERATIONS = 20_000
-# products that differ by a constant factor are recorded once, without this factor. But the factor stays in the product
-# if results might underflow or overflow: if |factor| is not between MIN_FACTOR and 1 / MIN_FACTOR, and in the squares
-# by which a power with an exponent above HIGH_EXPONENT is computed
+# products that differ by a constant factor are recorded once, without this factor. To avoid underflow and overflow, a
+# product is recorded with its factor if |factor| is not between MIN_FACTOR and 1 / MIN_FACTOR. Squares that yield a
+# power with an exponent above HIGH_EXPONENT are also recorded with their factors
 MIN_FACTOR, HIGH_EXPONENT = 1e-100, 8
 # end of the message if a callback compares an expression, or converts an expression to a number
 BRANCHING_REASON = "it branches on, or converts to a number, what depends on t, q or v"
@@ -183,7 +183,7 @@ class Graph(SymbolicObject):
         return self.operation(op.PRODUCT, a, b)
 
     def square(self, expr: "Affine", is_high_power: bool) -> "Affine":
-        """Return the square of `expr`; if `is_high_power`, the recorded product keeps the constant factor of `expr`."""
+        """Return `expr` squared; if `is_high_power`, record it with the constant factor of `expr`, else without."""
         return self._product(expr, expr) if is_high_power and expr.terms else self.product(expr, expr)
 
 

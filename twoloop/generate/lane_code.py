@@ -181,7 +181,7 @@ class LaneSteps:
         """
         n, (rtol, atol) = self.n, self.tolerances(emit, control)
         order, h = emit.to_double(memory.order), emit.load(memory.work, lanes.H)
-        # if the step size h is 0, per_duration is infinite: then the tolerances of positions allow any defect
+        # if the step size h is 0, per_duration is infinite: then only the tolerances of velocities limit the defect
         duration, per_duration = h / order, order / h
         largest = max_defect = emit.constant(0.0)
         for each in a:
@@ -228,7 +228,7 @@ class LaneSteps:
     def accept_or_reject(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
         """Write code that accepts (ACCEPTED = 1) or rejects steps, and stores LONGEST, the limit of the next step size.
 
-        After too many rejections or a value that is not finite, a run leaves its lane: RUNNING = 0.
+        A run leaves its lane (RUNNING = 0) after over MAX_REJECTIONS rejections in a row, or if a value is not finite.
         """
         builder, one = emit.builder, emit.constant(1.0)
         select, per_order = builder.select, one / emit.to_double(order)
@@ -375,7 +375,7 @@ class LaneStages:
         return [np.asarray(each).tobytes() for each in self.tableau]
 
     def write(self, emit: LaneEmitter, arguments: tuple[Value, Value, Value], memory: LaneMemory) -> None:
-        """Write code that stores the state NEW, X seconds after a step began, and the step's ERROR if it ends there."""
+        """Write code that stores NEW, the state at the end of a step of X seconds, and ERROR, the estimated error."""
         A, b, c, fine_weights, coarse_weights = self.tableau
         _, control, work = arguments
         x, t = emit.load(work, lanes.X), emit.load(work, lanes.T)
@@ -550,8 +550,8 @@ class LaneCode(LaneSteps):
     def check_defect_within(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
         """Write code that stores WORST_DEFECT, the largest defect at several times within the step.
 
-        The times are equidistant, at most GAP (s) apart. In each step, the times are moved by another fraction SHIFT of
-        the distance that GAP allows. Finally, T_NEW is the time at the end of the step.
+        The times are equidistant, at most GAP (s) apart. They are moved back or forth by a fraction of the distance
+        that GAP allows; the fraction, 2 SHIFT - 1, varies from step to step. Finally, T_NEW is the end of the step.
         """
         builder, memory = emit.builder, self.memory(emit, order, control, work)
         h, gap = emit.load(work, lanes.H), broadcast_entry(emit, control, lanes.GAP)
@@ -579,7 +579,7 @@ class LaneCode(LaneSteps):
         emit.store(builder.select(is_last, t1, t + h), work, lanes.T_NEW)
 
     def correct_positions(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Write code for a Newton step to C = 0 if ACTIVE = 1; ACTIVE, UNCONVERGED become 1 if it is valid, else 0."""
+        """Write code for Newton steps to C = 0 if ACTIVE = 1; valid steps set ACTIVE, UNCONVERGED to 1, others to 0."""
         is_active, _ = self._project(
             emit, self.equations.position_projection, lanes.ACTIVE, self.memory(emit, order, control, work)
         )

@@ -11,16 +11,16 @@ import math
 from twoloop.kernels.data.common import compiled, exact
 
 # kinds of operations. SUM is a sum of terms; RESULT is a sum of terms that is an output of the program. PENDING is a
-# product x y in a Taylor series; the coefficient of order k of y is an unknown of linear equations for the order k
+# product x y of Taylor series without one term: coefficient k of the product omits the unknown coefficient k of y
 PRODUCT, RECIPROCAL, SQUARE_ROOT, EXPONENTIAL, SINE, COSINE, LOGARITHM, ARCTANGENT, PENDING, SUM, RESULT = range(11)
 # columns of the table of a program, which has one row for each operation. `nodes` are the numbers that the program
 # reads and computes. Each argument of an operation is a constant plus terms; a term is a coefficient times a node.
 # - KIND: kind of the operation, such as SINE; NODE: index of the operation's result in `nodes`
 # - FIRST, SECOND, END: terms FIRST to SECOND - 1 of the list of terms make argument 1, SECOND to END - 1 argument 2
 KIND, NODE, FIRST, SECOND, END, N_COLUMNS = range(6)
-# A program is a vector of integers. It begins with the numbers of nodes, rows, terms and results, at the indices below.
-# Then follow the rows of the table; for each term, the index of the node that it multiplies; and for each result, the
-# index of the result in w.Gamma or in the flattened C_q. The results are the last nodes
+# A program is a vector of integers. It begins with the numbers of nodes, operations, terms and results, at the indices
+# below. Three lists follow: for each operation, a row of the table; for each term, the index of the node that it
+# multiplies; for each result, its index in w.Gamma or in the flattened C_q. The results are the last nodes
 N_NODES, N_ROWS, N_TERMS, N_RESULTS, N_SIZES = range(5)
 
 

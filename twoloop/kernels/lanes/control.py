@@ -129,7 +129,7 @@ def set_end(work, control):
 
 @compiled
 def end_steps(code, settings, control, work, predicted_v):
-    """Project NEW, the state at the end of the step, onto the constraints; include this change in the estimate ERROR.
+    """Project NEW, the state at the end of the step, onto the constraints; the change of NEW may raise ERROR.
 
     Changes by the projection show two errors: the largest change of a velocity, in tolerances, and PREDICTION_ERROR,
     which measures the change of positions. ERROR becomes the largest of these and the method's error estimate. So a
@@ -245,7 +245,7 @@ def step_by_series(code, settings, control, options, work, status, n_steps, with
     code.compute_series(order, control, work)
     code.choose_sizes(order, control, work)
     _round_steps(work, control)
-    for k in range(LANES):  # store X, the step size in units of UNIT, and the number of evaluations added in long steps
+    for k in range(LANES):  # X: step size / UNIT; EVALUATED: number of evaluations within a step longer than GAP (s)
         work[at.X * LANES + k] = work[at.H * LANES + k] / work[at.UNIT * LANES + k]
         if work[at.ACTIVE * LANES + k] == 1.0 and work[at.H * LANES + k] > control[at.GAP]:
             work[at.EVALUATED * LANES + k] = np.ceil(work[at.H * LANES + k] / control[at.GAP]) - 1.0

@@ -51,7 +51,7 @@ def select_rows(G, min_sine, basis, factors, kept):
     A row is selected if the sine of its angle to the span of the rows selected before exceeds `min_sine`. This angle is
     found by Gram-Schmidt orthogonalisation, which is repeated if the orthogonal part of the row is small. On return,
     the rows of `basis` are orthonormal, and the matrix of selected rows is the lower triangle `factors` times `basis`.
-    Both arrays have one row more than G can have independent rows; this row is scratch.
+    Both arrays have one more row than G can have independent rows; this last row is scratch.
     """
     n_kept = 0
     for k in range(len(G)):
@@ -146,14 +146,14 @@ def singular_values_exceed(rows, ratio, gram):
     return math.isfinite(total) and ldl_factor(gram)
 
 
-BOUND_ROUNDING = 1e-12  # a bound of pivots is reduced by this fraction, so that a pivot equal to the bound is above it
-NOT_DEFINITE, STAYS_SINGULAR = -1, -2  # codes: M + sum s g^T g is not positive definite; no rows g make it invertible
+BOUND_ROUNDING = 1e-12  # a bound of pivots is reduced by this fraction: a pivot equal to the bound counts as above it
+NOT_DEFINITE, STAYS_SINGULAR = -1, -2  # codes: M + sum s g^T g is not positive definite; it is singular for any rows g
 TINY = 1e-300  # replaces zero as a divisor
 # Limits that decide whether a row of G is independent of previous rows. S = G M^-1 G^T, scaled to a diagonal of 1, is
 # factored. A row is independent if its pivot in S exceeds INDEPENDENT: then its part orthogonal to previous rows is at
 # least 3e-9 of its norm, the square root of INDEPENDENT * SIMILAR_EIGENVALUES. A row is dependent if this part is at
-# most DEPENDENT times its norm. If some row is neither, or if the smallest eigenvalue of the mass matrix M may be below
-# SIMILAR_EIGENVALUES times the largest, `select_rows` decides for all rows
+# most DEPENDENT times its norm. If a row is neither independent nor dependent by these limits, or if the smallest
+# eigenvalue of the mass matrix M may be below SIMILAR_EIGENVALUES times the largest, `select_rows` decides for all rows
 SIMILAR_EIGENVALUES, INDEPENDENT, DEPENDENT = 1e-7, 1e-10, 1e-10
 # A redundant row is a linear combination of independent rows, all scaled to norm 1. It replaces an independent row if
 # the coefficient of this row exceeds MAX_COEFFICIENT. Then the independent rows are farther from becoming dependent,
@@ -201,7 +201,7 @@ def _eigenvalue_bounds(mass):
 
 @compiled
 def _count_weak_eigenvalues(mass, weak_ratio, A):
-    """Count eigenvalues of M = `mass` up to z = weak_ratio * (upper bound of all); store factors of M - z I in A."""
+    """Count eigenvalues of M = `mass` up to z = weak_ratio * (bound of the largest); store factors of M - z I in A."""
     _, largest = _eigenvalue_bounds(mass)
     copy_matrix(mass, A)
     for i in range(len(mass)):
@@ -239,9 +239,9 @@ def _removes_weak_eigenvalue(A, g, scale, x):
 
 @merged
 def _add_rows_to_mass(mass, G, weak_ratio, scale, A, x, order, added):
-    """Add scale * g^T g to the mass matrix M, for some rows g of G, until all its eigenvalues are large enough.
+    """Add scale * g^T g to the mass matrix M, for some rows g of G, until all eigenvalues of M exceed a limit.
 
-    All eigenvalues must exceed `weak_ratio` times an upper bound of the largest. Rows are tried in the sequence of
+    The limit is `weak_ratio` times an upper bound of the largest eigenvalue. Rows are tried in the sequence of
     `order`; on return, -1 replaces added rows in `order`. Store the indices of added rows in `added`; return their
     number, or STAYS_SINGULAR if eigenvalues are still too small and no further row helps.
     """
@@ -395,8 +395,8 @@ def _first_bound_below_pivots(S, kept, n_kept, largest_inverse, bounds, scratch)
     """Return the index of the first of `bounds` that is below all pivots of S; if there is none, return bounds.size.
 
     S is G M^-1 G^T, scaled to a diagonal of 1, for the rows `kept` of G. A bound z is below all pivots, whatever the
-    order of elimination, if S - z I is positive definite. This cannot be so if z exceeds the smallest pivot,
-    1 / `largest_inverse`. If `largest_inverse` is 0, it is computed first.
+    order of elimination, if S - z I is positive definite. This matrix is not positive definite if z
+    exceeds the smallest pivot, 1 / `largest_inverse`. If `largest_inverse` is 0, compute it first.
     """
     shifted = scratch[: n_kept * n_kept].reshape((n_kept, n_kept))
     if largest_inverse == 0.0:
@@ -467,7 +467,7 @@ def choose_rows(original_mass, G, min_sine, weak_ratio, bounds, workspace, chose
         largest_inverse = _find_dependent_rows(S, G, sizes, U, C, x, order)
     if largest_inverse > 0.0:
         chosen[0] = n_kept = _exchange_rows(C, order, kept)
-        # the largest 1 / pivot becomes unknown (0) if there are redundant rows, because rows may have been exchanged
+        # if there are redundant rows, rows may have been exchanged: then 0 says that the largest 1 / pivot is unknown
         largest_inverse = largest_inverse if n_kept == n_rows else 0.0
         first_bound = _first_bound_below_pivots(S, kept, n_kept, largest_inverse, bounds, scratch)
         if first_bound < bounds.size:  # all pivots exceed a bound: the chosen rows are certainly independent

@@ -82,8 +82,8 @@ UNDECIDED, CONVERGED, DIVERGED = range(3)  # codes of `_test_convergence`
 def _test_convergence(change, last_change, first_change, rounded, iteration, tolerance, q):
     """Decide whether an iteration has converged: return UNDECIDED, CONVERGED or DIVERGED.
 
-    It has converged if the stages change by at most `tolerance`, or if rounding errors of q keep their change from
-    decreasing. `rounded`: change of the stages relative to max(1, |value|), to be compared with rounding errors.
+    It has converged if the stages change by at most `tolerance`, or if this change does not decrease, and may be due
+    to rounding errors of q. `rounded`: change relative to max(1, |value|), to be compared with rounding errors.
     """
     if change <= tolerance:
         return CONVERGED
