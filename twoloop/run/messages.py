@@ -85,8 +85,8 @@ INITIAL_FACTOR = 0.1
 # in a power iteration x -> J x, the dominant eigenvalue of J is negative if cos(x, J x) is below minus this number
 MIN_ALIGNMENT = 0.9
 MIN_STEPS = 200  # after fewer accepted steps, a message does not mention stiffness
-# a method is stable if (step size) * (rate of the fastest vibration or decay) is at most a limit. Stability limits
-# steps if the median of this product / limit in all samples is at least this; in other runs, the median is about 0.4
+# a method is stable if (step size) * (rate of the fastest vibration or decay) is at most a limit. Steps count as
+# limited by stability if the median of this product / limit in all samples is at least this; other runs have about 0.4
 MIN_STABILITY_RATIO = 0.45
 
 
@@ -420,7 +420,7 @@ def warn_of_singular_end(run: "Run") -> str:
 
 
 def warn_of_inaccurate_crossing(run: "Run") -> str:
-    """Warn if steps other than crossings may have passed a singular position inaccurately; return the warning, or ""."""
+    """Warn if steps other than crossings may have passed a singular position inaccurately; return the warning or ""."""
     ratio = float(run.clock[run.a.PIVOT_PASSED])
     if ratio == 0.0:
         return ""

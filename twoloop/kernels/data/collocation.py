@@ -43,7 +43,7 @@ CONVERGED, REJECTED, GUESSED, NOT_COMPUTED = range(4)
     ALLOWED_H,  # largest size (s) with which the last step would have satisfied the error test
     SIZE,  # largest |v| + H |a| (H: step size) where the step begins, relative to tolerances: scale of rounding errors
     STRICTER,  # (largest of all WEIGHTS) / (largest WEIGHTS of iterated coordinates), a factor on changes by sweeps
-    REPEATS,  # 1: a sweep (iteration) evaluates accelerations twice, first at old, then at new velocities; 0: once
+    REPEATS,  # 1: a sweep (iteration) evaluates accelerations at old, then at new velocities; 0: only at old velocities
 ) = range(29)
 POWERS = 32  # index of the first of eight numbers: powers 1 to 8 of (size of this step / size of the step before)
 SCALED = 40  # index of the first of eight products: (coefficient of the predicting polynomial) * (number in POWERS)

@@ -129,7 +129,7 @@ def set_end(work, control):
 
 @compiled
 def end_steps(code, settings, control, work, predicted_v):
-    """Project NEW, the state at the end of the step, onto the constraints; the change of NEW may raise ERROR.
+    """Project NEW, the state at the end of the step, onto the constraints; the change of NEW may increase ERROR.
 
     Changes by the projection show two errors: the largest change of a velocity, in tolerances, and PREDICTION_ERROR,
     which measures the change of positions. ERROR becomes the largest of these and the method's error estimate. So a
