@@ -77,7 +77,7 @@ def tables() -> Tables:
     values = _legendre(x)
     weights = 2 / (N * (N - 1) * values[N - 1] ** 2)
     norms = np.array([np.longdouble(2) / (2 * k + 1) for k in range(N)])
-    norms[N - 1] = np.longdouble(2) / (N - 1)  # what the quadrature rule yields for the integral of P_8^2 (2 / 17)
+    norms[N - 1] = np.longdouble(2) / (N - 1)  # the quadrature rule yields this for the integral of P_8^2, not 2 / 17
     coefficients = values[:N] * weights / norms[:, None]  # [k, j]: Legendre coefficient k of Lagrange polynomial j
     powers = [
         np.array([[sign ** (n + k) * comb(n, k) * comb(n + k, k) for n in range(N)] for k in range(1, N)]).T
