@@ -75,7 +75,7 @@ class Phi(Value):
         self.incoming: list[tuple[Value, Block]] = []
 
     def add_incoming(self, value: Value, block: "Block") -> None:
-        """Add the value that the phi node takes if `block` was the last block before its own."""
+        """Add the value that the phi node takes if the program has jumped from `block` to the block of the node."""
         self.incoming.append((value, block))
 
     def line(self) -> str:
@@ -144,7 +144,7 @@ class Module:
 
     def __init__(self, splits_blocks: bool = False) -> None:
         self.splits_blocks = splits_blocks
-        self.block_addresses: list[str] = []  # addresses of parts of split blocks, stored so that LLVM keeps them apart
+        self.block_addresses: list[str] = []  # LLVM does not merge the parts of split blocks whose addresses are here
         self._tables: list[str] = []
         self._numbers: list[float] = []  # numbers that `Builder.load_constant` loads
         self._declared: dict[str, str] = {}

@@ -195,7 +195,7 @@ class Recorder:
             self._rows[-1, : len(row)] = row
 
     def store_crossing(self, memory: Array) -> None:
-        """If a crossing step from the last state stored a polynomial in `memory`, copy `memory` for dense output."""
+        """If `memory` has a polynomial of the crossing step from the last state, copy `memory` for dense output."""
         from twoloop.kernels.steps.crossing_step import END, N_STORED
 
         if self.interpolator is not None and memory[-N_STORED:][END] > -np.inf:
@@ -206,7 +206,7 @@ class Recorder:
         request, store = self.request, self.request.store
         if request.times is None:
             self._store_states(t, rows)
-        elif request.ends_at_outputs:  # steps may also end at times that are not output times
+        elif request.ends_at_outputs:  # steps may also end between output times: leave these states out
             is_output = np.append(request.times, np.inf)[np.searchsorted(request.times, t)] == t
             self._store_states(t[is_output], rows[is_output])
         if request.dense:
@@ -307,7 +307,7 @@ class Recorder:
         return DenseSolution(self.interpolator, table, end if self.end_event is None else self.end_event[1])
 
     def events(self) -> tuple[list[Array], list[Array], list[Array]] | tuple[None, None, None]:
-        """Return times, coordinates, velocities: lists of one array per event function, all None without functions."""
+        """Return times, q and v of events: lists of one array per event function, or three None if there is none."""
         if self.search is None:
             return None, None, None
         n = self._n_q
@@ -534,7 +534,7 @@ INITIAL_COUNTS = np.array([0, 0, 1])
 
 
 def step_fields(steps: Array, counts: Integers) -> dict[str, NDArray[Any]]:
-    """Return the fields with one row per step, such as the step size h, from rows of steps that kernels store.
+    """Return the fields of a record that have one row per step, such as the step size h; `steps`: rows from kernels.
 
     `counts`: the three counts of INITIAL_COUNTS before these steps; on return, after these steps.
     """
@@ -556,7 +556,7 @@ def state_fields(n: int, t: Array, table: Array) -> dict[str, Array]:
 
 
 def interval_kinds(run: "Run", steps: Array) -> Integers:
-    """Return the kinds of `steps` of the run's own method: codes that say which data dense output interpolates."""
+    """Return a code for each step: the kind of its interval, for dense output. No step is a crossing."""
     if run.plan.separate:
         return np.full(len(steps), indices.SEPARATE)
     explicit_kind = indices.ACROSS if run.substituted else indices.ACCELERATIONS

@@ -51,7 +51,7 @@ class DeferredFunctions:
         return self.functions.addresses
 
 
-_FUNCTIONS_IN_MEMORY: dict[str, BoundedCache] = defaultdict(BoundedCache)  # GeneratedFunctions by kind, then by key
+_FUNCTIONS_IN_MEMORY: dict[str, BoundedCache] = defaultdict(BoundedCache)  # {kind: {key: GeneratedFunctions}}
 
 
 def generated_functions(

@@ -55,7 +55,7 @@ def jitable_templates(function: Any) -> list[Any]:
         return []
     closures = [getattr(getattr(each, "_overload_func", None), "__closure__", None) for each in templates]
     is_own = [any(cell.cell_contents is function for cell in source or ()) for source in closures]
-    return templates if all(is_own) else []  # []: numba compiles calls of this function from an overload
+    return templates if all(is_own) else []  # []: an `overload` replaces `function` in compiled code
 
 
 def add_signature(function: Dispatcher, signature: Any) -> None:
@@ -257,7 +257,7 @@ class _HelperLibrary(CPUCodeLibrary):
         return 0  # Python never calls a helper
 
     def _optimize_final_module(self) -> None:
-        pass  # the code is optimised as part of the callers
+        pass  # the code of a helper is optimised as part of its callers
 
     def _get_module_for_linking(self) -> Any:
         """Return the module to link into callers; numba would return a copy, but nothing else uses this module."""

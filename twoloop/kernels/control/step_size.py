@@ -66,7 +66,7 @@ def record_accepted_step(rule, past, h, error):
 @compiled
 def project_and_evaluate(f, w, t, Q, V, A):
     """Project the state (Q, V) onto the constraints; store its accelerations in A; return DONE or a failure code."""
-    # in generated code, the task PROJECT costs less than EVALUATE; in the fixed-order form, EVALUATE does not project
+    # the task EVALUATE is slower in generated code, and does not project in the fixed-order form: use the task PROJECT
     if (f.is_generated == 1 and w.Rate.size == w.C.size) or f.form == FIXED_ORDER:
         return f.inner(f, w, PROJECT, t, Q, V, INNER_TOL, A, w.lam)
     return evaluate(f, w, t, Q, V, INNER_TOL, A)
@@ -85,7 +85,7 @@ def size_on_grid(clock, t, h, target, goal):
     """Choose the size of a step from t in a run with steps of fixed size h, which end at the grid times T_START + k h.
 
     Return the size (s), the number of grid times that the step reaches (0 or 1), and True if it reaches `goal`.
-    `target`: next output time; a grid time counts as equal if it differs by at most h / 10^6. `goal`: `target`, or the
+    `target`: next output time; a grid time within h / 10^6 of `target` counts as equal to it. `goal`: `target`, or the
     time of a jump of a constraint rate (C_t, b) before `target`.
     """
     rounding = EQUAL_SPACINGS * np.spacing(max(abs(t), abs(target)))
@@ -121,7 +121,7 @@ H_LONG_DECAY = 0.98  # factor by which each accepted step reduces clock[H_LONG],
 
 @merged
 def count_step(w, tolerances, control, clock, size, out_step):
-    """Record an accepted step of `size` (s) in `out_step`, statistics in `w`, and the longest recent size, H_LONG."""
+    """Store an accepted step of `size` (s) in `out_step`, counts in `w`, and the longest recent size in `clock`."""
     w.n_accepted += 1
     if w.defect >= 0.0:
         w.largest_defect = max(w.largest_defect, w.defect)

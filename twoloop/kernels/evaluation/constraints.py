@@ -27,7 +27,7 @@ def constraint_rows(f, w, t, q, G):
 def clear_rows(f, w):
     """Set the constraint Jacobian w.G to zero; in the augmented form, only its nonzero entries, see w.row_entries."""
     if f.form == AUGMENTED:
-        for i in range(w.Rate.size):  # other entries are zero: the task VERIFY_PATTERN detects any that are not
+        for i in range(w.Rate.size):  # entries not in w.row_entries are zero: the task VERIFY_PATTERN tests it
             for k in range(w.row_entries[i], w.row_entries[i + 1]):
                 w.G[i, w.row_entries[k]] = 0.0
     else:
@@ -171,7 +171,7 @@ def _fill_gamma(f, w, t, q, v, e, first, last):
 
 @merged
 def _max_disagreement(w):
-    """Return the allowed difference of Gamma with the time steps e and 2 e; the error of Gamma is less than this."""
+    """Return the allowed difference between Gamma with the time step e and with 2 e; Gamma has a smaller error."""
     return max(w.gamma_required, ROUNDING_DISAGREEMENT) * w.gamma_scale
 
 

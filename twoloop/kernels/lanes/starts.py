@@ -6,7 +6,7 @@ of Z, an eigenvector of G G^T, contains the coefficients of a combination of row
 right-hand sides along the rows of Z are removed, and Z^T Z is added to G G^T, so that the sum is not singular.
 
 `pattern` is the sparsity pattern of G. Its first n_rows + 1 entries are indices in `pattern`: the columns of row i are
-the entries from pattern[i] to pattern[i + 1] - 1. Matrices and vectors in `work` are given by offsets, in vectors.
+pattern[pattern[i]:pattern[i + 1]]. An array in `work` is given by its offset, counted in vectors (one number per lane).
 
 Two further kernels check the results of runs in lanes: they evaluate the callbacks, and store residuals.
 """
@@ -310,7 +310,7 @@ def _gauss_newton(code, settings, control, pattern, moves, work):
                 continue
             for j in range(n):
                 work[(new + j) * LANES + k] += work[(change + j) * LANES + k]
-            # C is older than this change: if C is a rounding error, the lane has converged, and the change improves q
+            # C was computed before this change. If C is a rounding error, the lane has converged; the change improves q
             if _constraints_hold(work, pattern, n, n_rows, memory, G, new, k):
                 work[at.UNCONVERGED * LANES + k] = 0.0
             else:

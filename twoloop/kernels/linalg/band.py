@@ -142,7 +142,7 @@ def add_banded_mass_times(f, w, x, y):
 
 @inlined
 def lu_band(numbers, n, b):
-    """Return the part of `numbers` for B (bandwidth b), later for the LU of B; entry (i, j) is at [j, 2 b + i - j]."""
+    """Return the part of `numbers` with a matrix of bandwidth b or its LU; entry (i, j) is at [j, 2 b + i - j]."""
     return numbers[: n * (3 * b + 1)].reshape((n, 3 * b + 1))
 
 

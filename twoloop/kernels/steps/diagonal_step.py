@@ -222,7 +222,7 @@ def stages_at_once(options):
 
 @compiled
 def _update_derivatives(f, w, options, tolerances, memory, t, h, Q, V, F):
-    """If they are outdated, compute derivatives at (t, Q, V; accelerations F) and Newton's factors; return a code."""
+    """Renew derivatives at (t, Q, V; accelerations F) and factors for Newton's method if outdated; return a code."""
     if f.force_by_q_given == 1 or memory[at.HAS_JACOBIAN] == 0.0:
         multipliers(f, w, t, Q, V, F, w.lam)
         memory[at.HAS_JACOBIAN] = 1.0
@@ -315,7 +315,7 @@ MAX_RATIO_BY_ONE_JUMP = 0.174
 
 @compiled
 def _filter_errors(f, w, options, memory, h, e_q, e_v):
-    """Remove stiff components of the estimated errors (e_q, e_v): multiply them by (I - z J)^-1, using stored factors.
+    """Remove stiff components of the errors (e_q, e_v): multiply by (I - z J)^-1 (J: Jacobian), using stored factors.
 
     z = h gamma; J is the Jacobian of velocities and accelerations by (q_i, v_i), the independent entries. The estimated
     errors of q and v are the first n_dof entries of e_q and e_v (n_q); the other entries are scratch.
@@ -431,9 +431,9 @@ def _apply_embedded_formula(f, w, options, memory, h, q1, v1):
 
 @compiled
 def _error_in_slow_directions(f, w, options, memory, h, tolerances, state, new_state, A_stage):
-    """Return the effect, in tolerances, of the slowly decaying part of the estimated velocity error E_V in `memory`.
+    """Return the effect on coordinates, in tolerances, of the slowly decaying part of the estimated velocity error E_V.
 
-    If all of E_V has an effect of at most 1, return 0. E_Q, E_V and Newton's factors are overwritten.
+    If all of E_V has an effect of at most 1, return 0. E_Q, E_V and Newton's factors, in `memory`, are overwritten.
     """
     n = w.Q.size
     e_q, e_v = vector(memory, 1, n, at.E_Q), vector(memory, 1, n, at.E_V)
@@ -489,7 +489,7 @@ def commit_diagonal(f, w, options, memory, tolerances, accepted):
     if accepted:
         s = int(options[at.DIAGONAL_OFFSET])
         _, A_stage, a_end = stage_views(memory, s, w.Q.size)
-        copy(A_stage[s - 1], a_end)  # in accelerations at the new state, stiffness would amplify Newton's last error
+        copy(A_stage[s - 1], a_end)  # not accelerations at the new state, where stiffness amplifies Newton's error
         memory[at.IS_FRESH] = 0.0
 
 

@@ -140,7 +140,7 @@ def estimate_end_error(tolerances, options, h, state, new_state, A_stage):
     N_REAL,  # number of real eigenvalues of the matrix A of the Butcher tableau
     N_PAIRS,  # number of pairs of conjugate complex eigenvalues of the matrix A of the Butcher tableau
     GAMMA0,  # constant of the error filter: first real eigenvalue of the tableau's A; if none is real, min |eigenvalue|
-    TESTS_VELOCITIES,  # 1: limit the estimated velocity errors themselves; 0: limit their effects, see `velocity_error`
+    TESTS_VELOCITIES,  # 1: limit estimated velocity errors; 0: limit their effects on coordinates, see `velocity_error`
     N_EIGEN_SCALARS,
 ) = range(5)
 
@@ -157,7 +157,7 @@ def estimate_end_error(tolerances, options, h, state, new_state, A_stage):
     CONTRACTION,  # (last correction of Newton's method) / (the correction before it)
     HAS_DAMPING,  # 1: forces depend on velocities; 0: they do not, so that derivatives by velocities are zero
     IS_SYMMETRIC,  # 1: Newton's matrix in diagonal_step.py is symmetric, and factored as L D L^T; 0: factored as L U
-    ERROR_DURATION,  # time (s) for which a velocity error changes positions, see velocity_errors.py; 0: unknown
+    ERROR_DURATION,  # time (s) until a velocity error decays or changes its sign, see velocity_errors.py; 0: unknown
     DERIVATIVES_RENEWED,  # 1: diagonal_step.py has computed new derivatives at the end of the step; 0: it has not
     N_MEMORY_SCALARS,
 ) = range(14)
