@@ -227,7 +227,7 @@ class PivotChooser:
         return replace(stiffened, min_pivot=float(MIN_PIVOTS[new_index]))
 
     def _stored_choice(self, index: int) -> PivotChoice:
-        """Return the PivotChoice that the compiled search found; raise Untraceable if it failed (`index` < 0)."""
+        """Return the PivotChoice from the compiled search; raise Untraceable if the search failed (`index` < 0)."""
         from twoloop.kernels.linalg.rank import STAYS_SINGULAR
 
         system, n_rows = self.system, self.system.n_c + self.system.n_a

@@ -49,7 +49,7 @@ class Value:
         self.builder: Any = builder
 
     def __str__(self) -> str:
-        """Return the type and the text, in the form of an argument of a call."""
+        """Return the type and the text, as the arguments of a call are written."""
         return f"{self.type} {self.text}"
 
     def __neg__(self) -> "Value":

@@ -80,7 +80,7 @@ def options_of(
     check_derivatives: Any,
     compiled: Any,
 ) -> Options:
-    """Return the validated options of a call; raise TypeError or ValueError if one is wrong.
+    """Return the validated options of a call of `solve_dae`; raise TypeError or ValueError if one is wrong.
 
     If all arguments are the same objects as in the last call, they are not checked again.
     """

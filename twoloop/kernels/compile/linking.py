@@ -209,7 +209,7 @@ _RULES: list[tuple[Any, str, Callable[..., Any]]] = [
     (event, "start_event", _skip_lock_events(event.start_event)),
     (event, "end_event", _skip_lock_events(event.end_event)),
 ]
-_MISSING_ATTRIBUTE = object()  # stands for the original of an inherited attribute: its replacement will be deleted
+_MISSING_ATTRIBUTE = object()  # stands for an inherited attribute: its replacement will be deleted, not reset
 _depth = [0]  # number of active contexts `kernel_rules`; only the outermost one replaces and restores functions
 
 

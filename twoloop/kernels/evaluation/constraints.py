@@ -117,7 +117,7 @@ def largest_difference_step(q, v):
 
 @merged
 def _difference_side(w, t, e):
-    """Return the side of t for differences: 0 (both) or, if C_t or b jumps near t, 1 (after t) or -1 (before t)."""
+    """Return where to take differences: 0 (around t) or, if C_t or b jumps near t, 1 (after t) or -1 (before t)."""
     since_jump, until_jump = t - w.last_jump, w.next_jump - t
     if min(since_jump, until_jump) >= 2.0 * e:
         return 0.0

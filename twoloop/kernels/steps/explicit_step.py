@@ -138,7 +138,7 @@ def explicit_step(f, w, options, memory, t, h, tolerances, state, new_state):
     )
     begin, width = N_VECTORS * _padded_width(n), _padded_width(n)
     slopes = memory[begin : begin + s * width].reshape((s, width))  # velocities and accelerations of each stage
-    # near a singular position, all stages are projected: otherwise, they could be beyond it, or their velocities wrong
+    # near a singular position, all stages are projected: unprojected ones could be beyond it or have wrong velocities
     is_near = options[FREE] == 1.0 and w.nearly_singular != 0.0
     is_free = options[FREE] == 1.0 and not is_near
     ratio_to_gap = gap_ratio(tolerances, h)
