@@ -11,7 +11,6 @@ from tests.problems import unconstrained
 from twoloop import ConstrainedSystem, Status, Stop, load, solve_with_stops
 from twoloop.bodies import PlanarModel, SpatialModel
 from twoloop.impacts.friction import Tangents, Undetermined, coulomb_forces, impulses
-from twoloop.run.fallbacks import units_of_equations
 
 GRAVITY = 9.81
 TIGHT = {"rtol": 1e-10, "atol": 1e-10}
@@ -290,8 +289,6 @@ def test_an_impact_on_a_chain_in_space_keeps_its_joints(rotation):
     hit = result.impacts[0]
     q = result.sol(hit.t).q
     assert np.abs(problem.system.velocity_constraint(hit.t, q, hit.v_after)).max() < 1e-9
-    units = units_of_equations(problem.system.mass(hit.t, q), problem.system.rows(hit.t, q))
-    assert np.ptp(units[3:7]) == np.ptp(units[10:14]) == 0.0  # of Euler parameters, of which one may have no inertia
 
 
 EQUAL, UNEQUAL = ([1.0] * 4, [1.0] * 3), ([1.0, 2.0, 1.5, 0.5], [0.3, 0.8, 0.2])  # masses and restitutions

@@ -18,7 +18,7 @@ from twoloop.kernels.data import indices
 from twoloop.methods.dop853 import DOP853
 from twoloop.problem.description import Stop
 from twoloop.problem.system import ConstrainedSystem
-from twoloop.run.fallbacks import NEGLIGIBLE_RATIO, units_of_equations
+from twoloop.run.fallbacks import equilibrating_units, independent_rows, solve_scaled
 from twoloop.run.run import Run
 from twoloop.run.singular_start import Branch, branch_at
 
@@ -136,6 +136,7 @@ class ContactSystem:
         self._system, self._gaps, self._closed = system, gaps, closed
         self._slides, self._sticking, self._slipping = slides, list(sticking), slipping
         self._offsets = np.array(list(sticking.values()))
+        self._units: Array | None = None  # found by the first call of `force`
         self._zero_velocity = np.zeros(system.n_q)
         self._derived = derive_callbacks(system, accept_traces)[0] if slipping else system
 
@@ -182,13 +183,14 @@ class ContactSystem:
         right_sides += [system.nonholonomic_gamma(t, q, v)] if system.n_a else []
         n, first_stop = system.n_q, system.n_q + system.n_c + system.n_a
         # the friction of sliding stops is proportional to the unknown forces of the stops, so it changes the matrix
-        mass = self._call("mass", t, q)
-        units, K = units_of_equations(mass, rows), np.block([[mass, rows.T], [rows, np.zeros((len(rows),) * 2)]])
+        K = np.block([[self._call("mass", t, q), rows.T], [rows, np.zeros((len(rows),) * 2)]])
         for place, k, coefficient in self._slipping:
             K[:n, first_stop + place] -= coefficient * slides[k]
-        right = np.concatenate([Q, *right_sides, -self._rows("bias", t, q, v)])
-        scaled = K * units * units[:, None], units * right
-        forces = (units * np.linalg.lstsq(*scaled, rcond=NEGLIGIBLE_RATIO)[0])[first_stop:]
+        right = np.concatenate([Q, *right_sides, -self._rows("bias", t, q, v)])[:, None]
+        if self._units is None:
+            self._units = equilibrating_units(K, n)
+        is_singular = len(independent_rows(rows)) < len(rows)
+        forces = solve_scaled(K, right, self._units, is_singular)[first_stop:, 0]
         return Q + sum(coefficient * forces[place] * slides[k] for place, k, coefficient in self._slipping)
 
     def build(self, names: str) -> ConstrainedSystem:

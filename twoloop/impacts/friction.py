@@ -13,7 +13,7 @@ from twoloop.checks.arguments import Array
 from twoloop.impacts.contact import Gap, Gaps
 from twoloop.problem.description import Stop
 from twoloop.problem.system import ConstrainedSystem
-from twoloop.run.fallbacks import NEGLIGIBLE_RATIO, scaled_equations
+from twoloop.run.fallbacks import NEGLIGIBLE_RATIO, velocity_changes
 
 if TYPE_CHECKING:
     from twoloop.bodies.model_problem import ModelProblem
@@ -47,10 +47,8 @@ class Tangents(NamedTuple):
 
 def responses(system: ConstrainedSystem, t: float, q: Array, W: Array) -> Array:
     """Return X (n_q, k), changes of velocities by unit impulses along rows W: M X + G^T Y = W^T, with G X = 0."""
-    matrix, units = scaled_equations(system, t, q)
-    right_side = np.vstack([W.T, np.zeros((len(matrix) - system.n_q, len(W)))]) * units[:, None]
-    solution = units[:, None] * np.linalg.lstsq(matrix, right_side, rcond=NEGLIGIBLE_RATIO)[0]
-    return np.asarray(solution[: system.n_q], dtype=float)
+    rows = system.rows(t, q)
+    return velocity_changes(system.mass(t, q), rows, W.T, np.zeros((len(rows), len(W))))
 
 
 def solve_complementarity(D: Array, b: Array) -> Array:

@@ -60,8 +60,9 @@ Array = NDArray[np.float64]
 N_CORRECTIONS = 3  # number of Newton steps that suffice to reduce errors of positions from the tolerances to rounding
 # in least-squares solutions, singular values up to this fraction of the largest count as zero (redundant rows)
 NEGLIGIBLE_RATIO = 1e-12
-UNIT_RATIO = 256.0  # the units of unknowns in least-squares problems are powers of this number
-MAX_RESIDUAL = 1e-8  # largest residual of the equations for v after a jump, relative to their right-hand side
+MAX_SCALINGS = 20  # largest number of iterations of `equilibrating_units`
+N_REFINEMENTS = 2  # number of times that a solution is corrected by the solution for its residual
+MAX_RESIDUAL = 1e-8  # largest residual of a constraint rate after a jump, relative to its terms and the largest jump
 
 
 def state_after_jump(system: ConstrainedSystem, t: float, q: Array, v: Array) -> Array | None:
@@ -71,16 +72,13 @@ def state_after_jump(system: ConstrainedSystem, t: float, q: Array, v: Array) ->
     change v to v+. The equations M (v+ - v) + G^T p = 0 and G v+ + (C_t, b) = 0 are solved for v+ and p.
     """
     q = corrected_positions(system, t, q)
-    mass, rows = system.mass(t, q), system.rows(t, q)
-    norms, largest = np.linalg.norm(rows, axis=1), float(np.abs(mass).max())
-    norms[norms == 0.0] = 1.0  # rows of zeros are not scaled
-    scaled = rows / norms[:, None] * largest
-    equations = np.block([[mass, scaled.T], [scaled, np.zeros((len(rows), len(rows)))]])
-    right_side = np.concatenate([np.zeros(system.n_q), -system.velocity_constraint(t, q, v) / norms * largest])
-    change = np.linalg.lstsq(equations, right_side, rcond=NEGLIGIBLE_RATIO)[0]
-    if not np.abs(equations @ change - right_side).max() <= MAX_RESIDUAL * np.abs(right_side).max():
+    rows, rates = system.rows(t, q), -system.velocity_constraint(t, q, v)
+    change = velocity_changes(system.mass(t, q), rows, np.zeros((system.n_q, 1)), rates[:, None])[:, 0]
+    if not (
+        np.abs(rows @ change - rates) <= MAX_RESIDUAL * (np.abs(rows) @ np.abs(change) + np.abs(rates).max())
+    ).all():
         return None
-    return np.concatenate([q, v + change[: system.n_q]])
+    return np.concatenate([q, v + change])
 
 
 def corrected_positions(system: ConstrainedSystem, t: float, q: Array) -> Array:
@@ -90,35 +88,72 @@ def corrected_positions(system: ConstrainedSystem, t: float, q: Array) -> Array:
     return q
 
 
-def scaled_equations(system: ConstrainedSystem, t: float, q: Array) -> tuple[Array, Array]:
-    """Return the scaled matrix U K U of K = [M G^T; G 0], and the diagonal of U, see `units_of_equations`.
+def velocity_changes(mass: Array, rows: Array, impulses: Array, rates: Array) -> Array:
+    """Return X (n_q, k) with M X + G^T P = `impulses` (n_q, k) and G X = `rates` (n_rows, k); P is not computed.
 
-    U is diagonal, with n_q + n_rows entries. The solution x of K x = r is U y, where y solves (U K U) y = U r.
+    If X is not unique, as without inertia in some direction, it is the least of the scaled solutions.
     """
-    mass, rows = system.mass(t, q), system.rows(t, q)
-    units = units_of_equations(mass, rows)
-    return np.block([[mass, rows.T], [rows, np.zeros((len(rows),) * 2)]]) * units * units[:, None], units
+    kept = independent_rows(rows)
+    matrix = np.block([[mass, rows[kept].T], [rows[kept], np.zeros((len(kept),) * 2)]])
+    units = equilibrating_units(matrix, len(mass))
+    return solve_scaled(matrix, np.vstack([impulses, rates[kept]]), units)[: len(mass)]
 
 
-def units_of_equations(mass: Array, rows: Array) -> Array:
-    """Return units of accelerations and multipliers in which the diagonal of M and the norms of rows of G are similar.
+def independent_rows(rows: Array) -> NDArray[np.int64]:
+    """Return the indices, in ascending order, of rows that span all `rows`."""
+    from scipy.linalg import qr  # imported here, as few runs need it
 
-    Without these units, the inertia of a small body beside a large one counts as zero (NEGLIGIBLE_RATIO). They are
-    powers of UNIT_RATIO, so that scaling causes no rounding errors, and leaves ordinary masses as they are.
+    norms = np.linalg.norm(rows, axis=1)
+    triangle, order = qr((rows / np.where(norms > 0.0, norms, 1.0)[:, None]).T, mode="r", pivoting=True)
+    pivots = np.abs(np.diagonal(triangle))
+    return np.sort(order[: int((pivots > NEGLIGIBLE_RATIO * pivots.max(initial=0.0)).sum())]).astype(np.int64)
+
+
+def solve_scaled(matrix: Array, right_side: Array, units: Array, is_singular: bool = False) -> Array:
+    """Solve K X = `right_side` (n, k) with K = `matrix` in `units` (n,), see `equilibrating_units`.
+
+    K is factorized by LU, as least squares lose digits of light bodies beside heavy ones. If it is singular, by
+    `is_singular` or to rounding, the least scaled X of least squares is returned.
     """
-    inertia, is_coupled, is_linked = np.abs(np.diagonal(mass)), mass != 0.0, rows != 0.0
-    # coordinates that M couples share their largest inertia: of a body's Euler parameters, one may have nearly none. A
-    # coordinate without inertia that M couples with no other takes the least inertia of others in the same rows of G
-    has_others = is_coupled.sum(axis=1) > (inertia > 0.0)
-    inertia = np.where(has_others, (is_coupled * inertia).max(axis=1), inertia)
-    known = np.where(inertia > 0.0, inertia, np.inf)
-    least_in_row = np.where(is_linked, known, np.inf).min(axis=1)
-    least = np.where(is_linked, least_in_row[:, None], np.inf).min(axis=0, initial=np.inf)
-    least = np.where(np.isfinite(least), least, min(float(known.min()), 1e300))
-    units = np.where(inertia > 0.0, inertia, least) ** -0.5
-    norms = np.linalg.norm(rows * units, axis=1)
-    units = np.append(units, 1.0 / np.where(norms > 0.0, norms, 1.0))
-    return UNIT_RATIO ** np.round(np.log2(units) / np.log2(UNIT_RATIO))
+    from scipy.linalg.lapack import dgecon, dgetrf, dgetrs
+
+    matrix, right_side = matrix * units * units[:, None], right_side * units[:, None]
+    factors, pivots, info = dgetrf(matrix)
+    if is_singular or info > 0 or dgecon(factors, np.abs(matrix).sum(axis=0).max())[0] < np.finfo(float).eps:
+        solution = np.asarray(np.linalg.lstsq(matrix, right_side, rcond=NEGLIGIBLE_RATIO)[0])
+    else:
+        solution = np.zeros_like(right_side)
+        for _ in range(1 + N_REFINEMENTS):
+            solution += dgetrs(factors, pivots, right_side - matrix @ solution)[0]
+    return units[:, None] * solution
+
+
+def equilibrating_units(matrix: Array, n_q: int) -> Array:
+    """Return units u for which the largest entry of each row of u_i K_ij u_j is about 1 (D. Ruiz, RAL-TR-2001-034).
+
+    They are not unique, as larger units of velocities and smaller ones of multipliers leave G as it is: for each set of
+    connected bodies, they are those in which the largest entry of M is 1. Units are powers of 2, so that scaling causes
+    no rounding errors.
+    """
+    from scipy.sparse.csgraph import connected_components
+
+    units: Array = np.ones(len(matrix))
+    for _ in range(MAX_SCALINGS):
+        scaled = np.abs(matrix * units * units[:, None])
+        factors = _root_of_inverse(np.maximum(scaled.max(axis=0), scaled.max(axis=1)))
+        if (factors == 1.0).all():
+            break
+        units *= factors
+    n_sets, sets = connected_components(matrix != 0.0, directed=False)
+    largest = np.zeros(n_sets)
+    np.maximum.at(largest, sets[:n_q], np.abs(matrix[:n_q, :n_q] * units[:n_q] * units[:n_q, None]).max(axis=1))
+    factors = _root_of_inverse(largest)[sets]
+    return units * np.append(factors[:n_q], 1.0 / factors[n_q:])
+
+
+def _root_of_inverse(values: Array) -> Array:
+    """Return the power of 2 that is nearest to values**-0.5; 1 for values of 0."""
+    return np.exp2(-np.round(0.5 * np.log2(np.where(values > 0.0, values, 1.0))))
 
 
 # the step sizes tried in turn across a singular position are these ratios times the first size. Larger sizes help if a
