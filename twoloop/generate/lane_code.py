@@ -88,7 +88,7 @@ class LaneSteps:
         self.n, self.n_rows = n, n_rows
 
     def update_unit(self, emit: LaneEmitter, control: Value, work: Value) -> Value:
-        """Write code that stores UNIT (s), the unit of time of a series: the step size that the last series allows."""
+        """Write code that stores UNIT (s), the unit of time of a new series: the step size that the old one allows."""
         select, unit = emit.builder.select, emit.load(work, lanes.UNIT)
         is_fresh, is_accepted = (is_set(emit, work, field) for field in (lanes.IS_NEW, lanes.ACCEPTED))
         duration = broadcast_entry(emit, control, lanes.T1) - broadcast_entry(emit, control, lanes.T0)
@@ -550,8 +550,8 @@ class LaneCode(LaneSteps):
     def check_defect_within(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
         """Write code that stores WORST_DEFECT, the largest defect at several times within the step.
 
-        The times are equidistant, at most GAP (s) apart. They are moved back or forth by a fraction of the distance
-        that GAP allows; the fraction, 2 SHIFT - 1, varies from step to step. Finally, T_NEW is the end of the step.
+        The step is divided into equal parts of at most GAP (s). The times are the ends of these parts, all moved by
+        (2 SHIFT - 1) * (GAP - size of a part); SHIFT varies from step to step. Finally, T_NEW is the end of the step.
         """
         builder, memory = emit.builder, self.memory(emit, order, control, work)
         h, gap = emit.load(work, lanes.H), broadcast_entry(emit, control, lanes.GAP)
@@ -579,7 +579,7 @@ class LaneCode(LaneSteps):
         emit.store(builder.select(is_last, t1, t + h), work, lanes.T_NEW)
 
     def correct_positions(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Write code for Newton steps to C = 0 if ACTIVE = 1; valid steps set ACTIVE, UNCONVERGED to 1, others to 0."""
+        """Write code for a Newton step to C = 0 in ACTIVE lanes; then ACTIVE = UNCONVERGED = 1 if valid, else 0."""
         is_active, _ = self._project(
             emit, self.equations.position_projection, lanes.ACTIVE, self.memory(emit, order, control, work)
         )
@@ -642,7 +642,7 @@ class LaneCode(LaneSteps):
         return is_valid, a
 
     def crossing_mask(self, emit: LaneEmitter, memory: LaneMemory) -> Value | None:
-        """Return `orientation_change_mask(...)`; None without constraints, or if defects are checked (Taylor steps)."""
+        """Return `orientation_change_mask(...)`; None without constraints and for Taylor steps, which check defects."""
         if self.recurrences is not None or len(self.equations.rows) == 0:
             return None
         ends_of_step = (lanes.T, memory.state), (lanes.T_NEW, memory.new)

@@ -110,7 +110,7 @@ class Program:
 
     @property
     def sizes(self) -> tuple[dict[str, int], int]:
-        """Return the sizes of the arrays, and the number of conditions."""
+        """Return the number of expressions in each array of the program, by its name, and the number of conditions."""
         return {name: len(exprs) for name, exprs in self.arrays.items()}, len(self.conditions)
 
     @property
@@ -202,7 +202,7 @@ class OperationTable(NamedTuple):
         )
 
     def as_floats(self) -> list[float]:
-        """Return the table as floats, which bodies/read_tables.py executes; here the first nodes are the results."""
+        """Return the table as floats for bodies/read_tables.py, with nodes renumbered so that results come first."""
         rows = self.rows.copy()
         is_result = rows[:, KIND] == RESULT
         n_results = int(is_result.sum())
@@ -226,7 +226,7 @@ class OperationTable(NamedTuple):
 
 Terms = tuple[tuple[int, float], ...]  # pairs of a quantity and its coefficient
 
-LITERALS = (0.0, 1.0, -1.0)  # numbers that generated code does not read from arrays: it needs no product with them
+LITERALS = (0.0, 1.0, -1.0)  # numbers that generated code need not multiply by; it reads all other numbers from arrays
 LITERAL_TOLERANCE = 8.0 * 2.0**-52  # largest difference between a coefficient and the literal 1 or -1 that replaces it
 
 
@@ -278,7 +278,7 @@ class Coefficients:
 
     @property
     def formulas(self) -> Any:
-        """Return an array of the coefficients (floats or Parameters); the same object until a coefficient is added."""
+        """Return an array of the coefficients (floats or Parameters): a new one only if coefficients were added."""
         if len(self._formulas) != len(self._values):
             self._formulas = number_array(self._values)
         return self._formulas

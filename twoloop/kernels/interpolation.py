@@ -26,7 +26,7 @@ MAX_VELOCITY_ROUNDING = 10.0
 SINGULAR_PIVOT_RATIO = 0.01
 SINGULAR_PIVOT = 1e-5
 # a position is also singular if its pivot ratio r is below WEAK_PIVOT, and r * (change of v by projection, in units of
-# the tolerances) is below MAX_VIOLATION. This product is about the removed violation, so small that it may be rounding
+# the tolerances) is below MAX_VIOLATION: this product approximates the removed violation, which may then be rounding
 MAX_VIOLATION, WEAK_PIVOT = 10.0, 0.05
 
 
@@ -212,7 +212,7 @@ def interpolate_states(f, w, tolerance, tolerances, t, states, groups, times, z,
 
 @merged
 def _state_difference(tolerances, scale_q, scale_v, states, i, q, v, q_other, v_other):
-    """Return the largest difference of two states, times scale_q for q and scale_v for v, in tolerances of state i."""
+    """Return the largest of scale_q |q_other - q| and scale_v |v_other - v|, relative to tolerances at states[i]."""
     n = q.size
     rtol, largest, total = tolerances[RTOL], 0.0, 0.0
     for m in range(n):
@@ -259,8 +259,8 @@ def estimate_errors(f, w, tolerance, tolerances, t, states, groups, z, coefficie
     `tolerance`: tolerance of the projection; z, coefficients, rows: scratch. The first estimate that applies is used:
     - 0, if the kind is SEPARATE or VELOCITIES, more than two states are interpolated, none of them inside the interval,
       and the steps between these states are about equally long
-    - the change of the polynomials if the last state is not interpolated. This estimate needs more than two states. It
-      must be at most 1, unless the kind is VELOCITIES, whose accelerations contain noise of stiff modes
+    - the difference from polynomials that leave out the last state, if more than two are interpolated. If it exceeds 1,
+      use the next estimate, unless the kind is VELOCITIES, whose accelerations contain noise of stiff modes
     - the larger of two differences at CHECKED_FRACTIONS. The first one is between a state before and after projection,
       the second one between accelerations by polynomials and by the equations of motion. With dt = h / (number of
       coefficients), the second one times dt counts as an error of v, and times dt^2 as an error of q

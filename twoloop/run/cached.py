@@ -89,7 +89,7 @@ STEPS = OutputRequest()  # request for output at the ends of all steps, without 
 
 @dataclass(frozen=True)
 class RepeatRequest:
-    """Result of a run that may have missed short changes of forces: the caller must repeat it."""
+    """Result of a run that may have missed short changes of forces: the caller must repeat the run."""
 
     max_gap: float  # longest time (s) that the repetition allows between two evaluations
     cpu_time: float  # CPU time of the run to be repeated (s)
@@ -162,7 +162,7 @@ class CachedIntegrator:
     ) -> dict[str, Any] | RepeatRequest | None:
         """Integrate a system from a start, if possible by one call of compiled code; return one of three results.
 
-        A dict: fields of the result; `later` is a function that computes other fields when they are read. A
+        A dict: fields of the result; its key "later" has a function that computes missing fields when they are read. A
         RepeatRequest: the run may have missed short changes of forces. None: the start needs more checks, or a callback
         has raised an exception; `set_up`, called next by the caller, checks the start and names the problem.
         """
@@ -347,7 +347,7 @@ def _deferred_field(
     options: Options,
     name: str,
 ) -> dict[str, Any]:
-    """Compute the field `name` of a result when it is first read; return a dict of all fields computed together."""
+    """Compute the field `name` of a result when it is first read, and similar fields; return a dict of all these."""
     if name == "message":
         return {name: describe_arrival(t1, options.step_size is not None)}
     loops, n_states, n_steps = cached_run(), int(data[0]), int(data[1])

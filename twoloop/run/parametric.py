@@ -101,7 +101,7 @@ class ParametricRun:
         return True
 
     def _fill_arrays(self, system: ConstrainedSystem) -> None:
-        """Write the parameters of a system, and the values of all expressions in them, to the arrays of the run."""
+        """Write a system's parameters, and the values of all expressions in these parameters, to the run's arrays."""
         self.current_system = system
         self._functions.p[:] = system.functions.p
         self._expression_arrays.write(self.shared.trace_cache.product_evaluator(self._functions.p))

@@ -84,7 +84,7 @@ class SignalHandlers:
 
 
 def signals_of(system: ConstrainedSystem) -> SignalHandlers:
-    """Return a context manager that, at its end, raises signal handlers' exceptions that its block has caught."""
+    """Return a context manager that, at its end, raises a signal handler's exception again if its block caught it."""
     return SignalHandlers(ctrl_c=system.called_in_python)
 
 

@@ -39,7 +39,7 @@ TIME_ROUNDING = 5e3  # error of the twelfth difference due to rounding of t, rel
 STEEPNESS = 4.0  # a part of a step is a ramp if C_t or b is this many times steeper in the part than in the whole step
 MAX_RAMP_SHARE = 0.125  # only a ramp of C_t or b that takes at most this fraction of a step is located within the step
 MIN_SPACINGS = 8.0  # bisection for a jump ends if the time span is at most this many spacings of floating-point times
-SMOOTH, RAMP, JUMP = range(3)  # C_t and b in a time span are SMOOTH, or have a steep RAMP or a kink, or have a JUMP
+SMOOTH, RAMP, JUMP = range(3)  # in a time span, C_t and b are SMOOTH, have a JUMP, or have a steep ramp or kink (RAMP)
 
 
 @compiled
@@ -162,7 +162,7 @@ SUDDEN_RATIO = 0.1  # a change is sudden if the second difference exceeds this f
 # a force, C_t or b counts as constant if its samples differ by at most LEAST_RANGE * rtol times the largest value so
 # far, or by at most LEAST_VALUE, as squares of smaller numbers underflow
 LEAST_RANGE, LEAST_VALUE = 0.1, 1e-150
-MIN_SAMPLES_IN_STEP = 8.0  # least number of samples in a step; stages may miss a force that lasts a quarter of a step
+MIN_SAMPLES_IN_STEP = 8.0  # least number of samples per step, as stages may miss a force that lasts a quarter of a step
 RESAMPLE_BELOW = 0.25  # sample again if samples must be closer than this fraction of the spacing of earlier samples
 MIN_SPACING = 16.0  # shortest time between samples, in spacings of floating-point numbers at t
 N_BISECTIONS = 20  # number of bisections that locate the time of a change between two samples
@@ -176,7 +176,7 @@ N_SAMPLES_IN_SHORT_STEP = 4  # number of samples within a short step, in search 
 # if a change of velocities by at most their tolerances changes an acceleration by more than this fraction of the
 # largest one, motion is not extrapolated with the present accelerations, see `_acceleration_lasts`
 MAX_LASTING_CHANGE = 0.5
-CHANGE_MARGIN = 0.01  # a step need not end at a change that follows within this fraction of the time between samples
+CHANGE_MARGIN = 0.01  # a step ignores a change within this fraction of the time between samples after the step's start
 # w.changes has a column for each force, C_t and b; rows 0 to N_SAMPLES contain samples at successive times
 LARGEST_ROW = N_SAMPLES + 1  # row of w.changes: largest |value| of each force, C_t and b so far
 MIDDLE_ROW = N_SAMPLES + 2  # row of w.changes: a sample at a time between two of the 21 samples, or before them
@@ -185,7 +185,7 @@ N_CHANGES = N_SAMPLES + 3  # number of rows of w.changes
 
 @compiled
 def _sample_forces(f, w, time, elapsed, q, v, a, values):
-    """Store forces, C_t and b at `time` in `values`; (q, v) moves for `elapsed` s with constant accelerations a."""
+    """Store forces, C_t and b at `time` in `values`, for the state to which constant a moves (q, v) in `elapsed` s."""
     for m in range(q.size):
         w.x[m] = q[m] + elapsed * (v[m] + 0.5 * elapsed * a[m])
         w.y[m] = v[m] + elapsed * a[m]
@@ -240,7 +240,7 @@ def _first_sudden_bend(values, n, detrends, min_range):
     subtracts the straight line from the first to the last searched sample if `detrends` is 1, nothing if it is 0.
     """
     index, limit = _find_sudden_bend(values, n, detrends * (values[n] - values[0]) / max(n, 1), min_range, False)
-    while index > 1:  # with strict = True: among few samples, bends of a smooth curve may also exceed the limit
+    while index > 1:  # `strict` is True, because bends of a smooth curve, too, may exceed the limit if samples are few
         slope = detrends * (values[index] - values[0]) / index
         earlier, bound = _find_sudden_bend(values, index, slope, min_range, True)
         if earlier == 0:
@@ -253,7 +253,7 @@ def _first_sudden_bend(values, n, detrends, min_range):
 def _is_sudden_change(previous, first_value, second_value, following, limit):
     """Return True if the change from `first_value` to `second_value` exceeds `limit` and the changes next to it.
 
-    It must exceed MIN_STEEPNESS_RATIO times each of the changes from `previous` and to `following` with the same sign.
+    A change next to it (from `previous`, or to `following`) counts MIN_STEEPNESS_RATIO times, or not if signs differ.
     """
     change = second_value - first_value
     sign = 1.0 if change > 0.0 else -1.0
@@ -431,7 +431,7 @@ def _sample_ahead(f, w, tolerances, control, clock, next_change, t, size, last, 
     if may_resample and max_spacing < RESAMPLE_BELOW * clock[at.SAMPLED_EVERY]:
         clock[at.SAMPLED_TO] = t
     begin = max(t, clock[at.SAMPLED_TO])
-    is_at_change = clock[at.DISCONTINUITY] == clock[at.SAMPLED_TO]  # True: keep samples as close as the last ones
+    is_at_change = clock[at.DISCONTINUITY] == clock[at.SAMPLED_TO]  # True: samples may be no farther apart than before
     while begin < min(t + size, last, next_change):
         spacing, is_at_change = min(max_spacing, clock[at.SAMPLED_EVERY]) if is_at_change else max_spacing, False
         clock[at.WIDEST_SAMPLING] = max(clock[at.WIDEST_SAMPLING], spacing)

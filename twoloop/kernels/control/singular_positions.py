@@ -20,7 +20,7 @@ SHRINKAGE = 0.8  # if a step with projected stages is rejected or fails, it is r
 MIN_STEP_NEAR_SINGULAR = 0.001  # shortest useful step near a singular position, relative to the longest recent step
 # if no crossing can be attempted, the run ends when the smallest pivot is below this fraction of its maximum in the run
 UNDETERMINED_PIVOT = 1e-6
-CHECK_INTERVAL = 16  # the partition, which generated code does not use, is checked once in this many of its steps
+CHECK_INTERVAL = 16  # steps of generated code need no partition, so only one in this number of such steps checks it
 # in the augmented form, with n degrees of freedom, the partition is checked every 1 + n // FREEDOMS_PER_CHECK steps,
 # because each check computes the null space of [C_q; A], a dense matrix that steps in this form do not need
 FREEDOMS_PER_CHECK = 32
@@ -151,8 +151,8 @@ def record_pivot_at_output(f, w, clock, state):
     """Set clock[PIVOT_AT_OUTPUT] to the smaller of its value and the pivot ratio at `state`, see `min_pivot_ratio`."""
     pivot = min_pivot_ratio(f, w, clock[at.T], state[: w.Q.size])
     if f.form == FIXED_ORDER and pivot > 0.0:
-        # pivots of the fixed-order form are sines of angles between rows. In large mechanisms, all of them are small:
-        # only a smallest pivot far below its largest value so far, clock[LARGEST_PIVOT], shows a singular position
+        # pivots of the fixed-order form are sines of angles between rows, all small in large mechanisms. So a singular
+        # position is near only if the smallest pivot is far below clock[LARGEST_PIVOT], its largest value so far
         pivot /= max(pivot, clock[at.LARGEST_PIVOT])
     clock[at.PIVOT_AT_OUTPUT] = min(clock[at.PIVOT_AT_OUTPUT], pivot)
 

@@ -27,7 +27,7 @@ def constraint_rows(f, w, t, q, G):
 def clear_rows(f, w):
     """Set the constraint Jacobian w.G to zero; in the augmented form, only its nonzero entries, see w.row_entries."""
     if f.form == AUGMENTED:
-        for i in range(w.Rate.size):  # entries not in w.row_entries are zero: the task VERIFY_PATTERN tests it
+        for i in range(w.Rate.size):  # entries not in w.row_entries are zero, as the task VERIFY_PATTERN checks
             for k in range(w.row_entries[i], w.row_entries[i + 1]):
                 w.G[i, w.row_entries[k]] = 0.0
     else:
@@ -171,7 +171,7 @@ def _fill_gamma(f, w, t, q, v, e, first, last):
 
 @merged
 def _max_disagreement(w):
-    """Return the allowed difference between Gamma with the time step e and with 2 e; Gamma has a smaller error."""
+    """Return the allowed difference between Gamma with the time steps e and 2 e; it exceeds the error of Gamma."""
     return max(w.gamma_required, ROUNDING_DISAGREEMENT) * w.gamma_scale
 
 
@@ -213,8 +213,8 @@ def gamma_by_differences(f, w, t, q, v, first, last):
     """Store Gamma[first:last] in w.Gamma, by differences; return DONE, or GAMMA_INACCURATE if no time step is accurate.
 
     Gamma = -d/de [G v + (C_t, b)](t + e, q + e v) at e = 0, where v is constant. Errors are relative to w.gamma_scale,
-    the size of Gamma so far. The time step e is w.gamma_step_ratio times `largest_difference_step`. If Gamma with e and
-    Gamma with 2 e differ too much, as with kilohertz drives, a new ratio is chosen.
+    the largest size of Gamma so far. The time step e is w.gamma_step_ratio times `largest_difference_step`. If Gamma
+    with e and Gamma with 2 e differ too much, as with kilohertz drives, a new ratio is chosen.
     """
     largest_step = largest_difference_step(q, v)
     e = representable_step(t, w.gamma_step_ratio * largest_step)

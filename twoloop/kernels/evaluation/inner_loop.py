@@ -421,6 +421,6 @@ def generated_inner_loop(f, w, task, t, q, v, theta, a, lam):
         if f.own_redundant(t, q, v, f.numbers, a):
             return DONE
         f.general(f, w, tasks.FIND_NULL_SPACE, t, q, v, theta, a, lam)  # stores the Jacobian, for the check below, in w
-    elif task <= tasks.MULTIPLIERS:  # these tasks use a partition: there is no generated code for them
+    elif task <= tasks.MULTIPLIERS:  # generated code cannot do these tasks, because they use a partition
         w.used_general = 1.0
     return f.general(f, w, task, t, q, v, theta, a, lam)
