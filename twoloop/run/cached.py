@@ -80,7 +80,7 @@ N_FIRST_CHUNKS = 4
 N_SKIPPED_CALLS = 16  # after an exception in a callback, this number of calls do not use the cached integrator
 STEP_FIELDS = (*STEP_ARRAYS, "stats")  # fields of a result that are computed from the array of steps
 NON_STEP_DEFAULTS = {name: value for name, value in DEFAULTS.items() if name not in STEP_FIELDS}
-SHORT_RUN = 1e-3  # if the last run took less CPU time (s), measure elapsed time: to read CPU time takes longer
+SHORT_RUN = 1e-3  # if the last run took less CPU time (s), measure elapsed time, which is read faster than CPU time
 HARMLESS = 0.01  # v0 need not satisfy the constraints exactly: projection may change v0 by this number of tolerances
 REACHED_END = Status.REACHED_END  # a global name is read faster than a member of an Enum
 

@@ -185,7 +185,7 @@ N_CHANGES = N_SAMPLES + 3  # number of rows of w.changes
 
 @compiled
 def _sample_forces(f, w, time, elapsed, q, v, a, values):
-    """Store forces, C_t and b at `time` in `values`, for the state to which constant a moves (q, v) in `elapsed` s."""
+    """Store forces, C_t, b at `time` in `values`, after (q, v) moved for `elapsed` s with constant accelerations a."""
     for m in range(q.size):
         w.x[m] = q[m] + elapsed * (v[m] + 0.5 * elapsed * a[m])
         w.y[m] = v[m] + elapsed * a[m]
