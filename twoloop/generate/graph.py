@@ -126,7 +126,7 @@ class Graph(SymbolicObject):
         return self.quantity(quantity)
 
     def quantities_for(self, exprs: Iterable["Affine"], available: Container[int] = ()) -> list[int]:
-        """Return the indices of the quantities to compute for `exprs`, arguments first, unless they are `available`."""
+        """Return the indices of all quantities to compute for `exprs`, except those in `available`; arguments first."""
         needed: set[int] = set()
         stack = [i for expr in exprs for i in expr.terms]
         while stack:

@@ -288,7 +288,7 @@ class Equations:
         self._results_before_copy: dict[str, Any] = {}  # in a copy: results of callbacks that the original has traced
 
     def trace_all(self) -> "Equations":
-        """Trace all callbacks of the system that can be traced, so that copies need not trace them; return self."""
+        """Trace all callbacks that run on symbols, so that copies of this object reuse the traces; return self."""
         for kind in TRACING_ORDER:
             if not self._is_derived(kind):
                 with suppress(Untraceable):  # if a callback is needed, `expressions` raises Untraceable again
@@ -328,7 +328,7 @@ class Equations:
         return self._gamma(*GAMMA_SOURCES[kind], self.v if v is None else v)
 
     def _derive_or_trace(self, kind: str, v: Sequence[Affine]) -> Any:
-        """Return the trace of the callback `kind`; if it is missing, derive C_q and gamma from other callbacks."""
+        """Return the result of the callback `kind`; without this callback, derive C_q or gamma from other callbacks."""
         if self._is_derived(kind):
             return self.derivatives(kind, v)
         if kind in self._results_before_copy and v is self.v:
@@ -341,7 +341,7 @@ class Equations:
         return kind not in self.system.given and kind in ("jacobian", *GAMMA_SOURCES)
 
     def _trace_callback(self, kind: str, v: Sequence[Affine]) -> Any:
-        """Run a callback on symbols and return its result as expressions; zeros if it is missing."""
+        """Run a callback on symbols and return its result as expressions; if the system has no such callback, zeros."""
         system, graph, (out,) = self.system, self.graph, self.system.arrays_of(kind)
         out, shape, p = out.astype(object), out.shape, self.parameters.copy()
         arrays = [symbol_array({"q": self.q, "v": v}[name]) for name in KINDS[kind].state]
@@ -561,7 +561,7 @@ def shared_cache(system: ConstrainedSystem) -> TraceCache:
 
 
 def trace_cache_of(system: ConstrainedSystem) -> TraceCache:
-    """Return the TraceCache for systems with equal callbacks, sizes, constant parameters and groups of parameters."""
+    """Return the TraceCache for systems with equal callbacks, sizes, constant parameters and `_parameter_groups`."""
     parameters = system.parameters
     groups = _parameter_groups(parameters)
     fixed_parameters = parameters[groups == 0] + 0.0  # -0.0 becomes 0.0, so that keys with zeros are equal
@@ -595,7 +595,7 @@ class ParameterArrays:
     def __init__(self) -> None:
         # keys: id of an array of expressions. Values: its numbers, and the array, so that no other array gets this id
         self._arrays: dict[int, tuple[Any, Array]] = {}
-        # for each array (numbers, indices, slice): `write` stores values[slice] in the varying numbers[indices]
+        # for each array: its numbers; indices of those that `write` overwrites; slice of `values` in `write` for them
         self._number_arrays: list[tuple[Array, NDArray[np.int64], slice]] = []
         self._products: dict[Powers, int] = {}
         self._scales: list[float] = []
@@ -628,7 +628,7 @@ class ParameterArrays:
         return numbers.reshape(exprs.shape)
 
     def write(self, product: Callable[[Powers], Any]) -> None:
-        """Write values of expressions to the arrays of numbers; `product`: result of TraceCache.product_evaluator."""
+        """Store values for new parameters in the arrays that `array` returned; `product`: see `product_evaluator`."""
         if self._gathered_products is None:
             return
         products, scales, product_indices = self._gathered_products

@@ -74,8 +74,8 @@ FIRST_STEP = 0.01  # first step size, relative to the shortest time scale of the
 MIN_FIRST_STEP = 1e4  # smallest first step size, in spacings of floating-point numbers at the start time
 MIN_GAP = 40.0  # the allowed time between evaluations is at least this number of spacings of floating-point times
 SHORTEST_STEP = 1e-16  # a run fails if a step would be shorter than this fraction of the first step
-# if forces may change suddenly with q or v, the allowed time (s) between two evaluations of the equations is this many
-# times shorter in steps that check their defect (DEFECT_GAP) than in other steps (GAP)
+# ratio of two longest allowed times (s) between evaluations, if forces may change suddenly with q or v: the time in
+# steps that do not check their defect (GAP) to the time in steps that do (DEFECT_GAP)
 GAP_RATIO = 10
 
 
@@ -83,8 +83,8 @@ GAP_RATIO = 10
 def _first_step_size(state, n, t, span, smallest):
     """Return the first step size (s): FIRST_STEP times the shortest time scale of the motion from `state` [q, v, a].
 
-    The time scales are the run's duration `span` (s), the times in which v or a changes q by max(max|q|, `smallest`),
-    and the time in which a changes v by max|v|. The step is at least MIN_FIRST_STEP floating-point spacings at t.
+    The time scales are the run's duration `span` (s), x / max|v| and sqrt(x / max|a|) with x = max(max|q|, `smallest`),
+    and max|v| / max|a|. The step is at least MIN_FIRST_STEP floating-point spacings at t.
     """
     distance, speed, acceleration = smallest, 0.0, 0.0
     for j in range(n):
@@ -203,7 +203,7 @@ RUN_ARRAYS.add_function("advance", i8(KIT, WORK, *(VECTOR,) * 9, MATRIX, MATRIX,
     EVALUATES_WITHIN,  # 1: the method adds evaluations within long steps; 0: it does not, which limits the step size
     NEAR_PIVOT,  # Python must check a run if, at an output time, (smallest / largest pivot of C_q) is below this
     MAX_CHANGE_RATIO,  # velocities jump in a step if max|change| > this * (step size) * (smaller max|a| of both ends)
-    MIN_SAMPLES,  # Python must check a run if sudden changes of a force, C_t or b are less than this many samples apart
+    MIN_SAMPLES,  # Python must check a run if two sudden changes of a force, C_t or b are under this many samples apart
 ) = range(18)
 # indices in `expected`, which lists the constraint rows that generated code uses (empty without generated code)
 (

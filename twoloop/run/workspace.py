@@ -70,7 +70,7 @@ def newton_form(
         q = q0 + scale * magnitude * rng.uniform(-1.0, 1.0, system.n_q)
         try:
             entries |= _derivative_entries(system, t0, q, rng.uniform(-1.0, 1.0, system.n_q), lam, max_entries)
-        except Exception:  # callbacks fail at q: skip this position; a run later finds the missing entries
+        except Exception:  # skip a position where callbacks fail; a run later finds entries that are missed here
             continue
         if len(entries) > max_entries:
             return None
@@ -139,7 +139,7 @@ class FixedOrderForm(NamedTuple):
         return self.n_groups + float(self.newton_program[N_UPDATES]) / max(1.0, float(self.program[N_UPDATES]))
 
     def newton_matrices_size(self, matrices: int) -> int:
-        """Return the length of the array of a plan's sparse matrices; `matrices`: number of dense ones they replace."""
+        """Return the length of the array that contains a plan's sparse matrices instead of `matrices` dense ones."""
         from twoloop.kernels.steps.newton_systems import matrices_size
         from twoloop.kernels.steps.stages import SYSTEMS
 
@@ -202,9 +202,9 @@ def _create_fixed_order_form(system: ConstrainedSystem, t0: float, q0: Array) ->
 
 
 def _coordinates_of_bodies(system: ConstrainedSystem, mass: Entries) -> list[tuple[int, ...]]:
-    """Return the indices of each body's coordinates; a body may be missing if no joint refers to it.
+    """Return the indices of each body's coordinates; a body may be missing if no Joint names its coordinates.
 
-    Each joint of the system refers to one body: so bodies at the ends of chains may be missing. If all bodies have
+    A Joint names the coordinates of one body only, so that the last body of a chain may be missing. If all bodies have
     seven coordinates (position and Euler parameters), no body is missing.
     """
     coordinates_by_joint = [joint.translation + joint.rotation for joint in system.joints]
@@ -282,7 +282,7 @@ def _mass_pattern(system: ConstrainedSystem, t0: float, q0: Array) -> Array:
     for scale, direction in zip(NEARBY[:1] if system.constant_mass else NEARBY, directions, strict=False):
         try:
             mass = system.mass(t0, q0 + scale * magnitudes * direction)
-        except Exception:  # callbacks fail: skip this position; a run later finds the missing entries
+        except Exception:  # skip a position where callbacks fail; a run later finds entries that are missed here
             continue
         pattern[(mass != 0.0) | (mass.T != 0.0)] = 1.0
     return pattern

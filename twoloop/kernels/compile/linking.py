@@ -243,18 +243,18 @@ class _CodegenWithoutEnvironment:
         return getattr(self._codegen, name)
 
     def set_env(self, name: str, environment: Any) -> None:
-        """Do nothing: a helper has no environment."""
+        """Do nothing: only functions that Python calls need this environment (their Python data)."""
 
 
 class _HelperLibrary(CPUCodeLibrary):
-    """LLVM's intermediate code of a helper; it becomes part of the machine code of callers."""
+    """LLVM's intermediate code of a helper (called by compiled functions only), to be linked into its callers."""
 
     @property
     def codegen(self) -> Any:
         return _CodegenWithoutEnvironment(self._codegen)
 
     def get_pointer_to_function(self, name: str) -> int:
-        return 0  # Python never calls a helper
+        return 0  # no address, because Python never calls a helper
 
     def _optimize_final_module(self) -> None:
         pass  # the code of a helper is optimised as part of its callers

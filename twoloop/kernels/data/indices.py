@@ -89,7 +89,7 @@ FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN, REACTION_BY_Q_GIVEN, MASS_VALUES_GIVEN = (
     WIDEST_GAP,  # longest time (s) between two evaluations of the equations within accepted steps
     LAST_JUMP,  # time (s) of the last known jump of a constraint rate (C_t, b); -infinite: none
     NEXT_JUMP,  # time (s) of the next known jump of a constraint rate (C_t, b), or end of the run; infinite: unknown
-    # largest |coefficient| of independent rows in redundant rows, at this partition's first check; 0: unknown
+    # largest |coefficient| of redundant rows as combinations of independent rows, when first checked; 0: not checked
     MAX_COEFFICIENT,
     SMALLEST,  # fixed-order form: least sin^2 of a row's angle to the span of earlier rows of C_q; -1: M not definite
     TIME_IS_UP,  # 1 (set by another thread): the time limit has passed, and evaluations return STOPPED; 0: not yet
@@ -125,7 +125,7 @@ WINDOW = 4  # number of accepted states that a polynomial of dense output interp
     SEPARATE,  # one polynomial interpolates q and v, and yields q; another interpolates v and a, and yields v
     VELOCITIES,  # one polynomial interpolates q and v, but not the accelerations a, which contain noise of stiff modes
     ACCELERATIONS,  # one polynomial interpolates q, v and a in the interval
-    ACROSS,  # one polynomial interpolates q, v and a, in steps across singular positions or by a substitute method
+    ACROSS,  # one polynomial interpolates q, v and a, across a singular position, or after another method took over
     JUMP,  # no polynomial: velocities jump in the interval, which is only a few spacings of floating-point times long
 ) = range(5)
 # columns of the table of intervals, which has one row for each interval that contains output times

@@ -19,8 +19,8 @@ PRODUCT, RECIPROCAL, SQUARE_ROOT, EXPONENTIAL, SINE, COSINE, LOGARITHM, ARCTANGE
 # - FIRST, SECOND, END: terms FIRST to SECOND - 1 of the list of terms make argument 1, SECOND to END - 1 argument 2
 KIND, NODE, FIRST, SECOND, END, N_COLUMNS = range(6)
 # A program is a vector of integers. It begins with the numbers of nodes, operations, terms and results, at the indices
-# below. Three lists follow: for each operation, a row of the table; for each term, the index of the node that it
-# multiplies; for each result, its index in w.Gamma or in the flattened C_q. The results are the last nodes
+# below. Three lists follow: for each operation, the numbers KIND to END; for each term, the index of the node that
+# it multiplies; for each result, its index in w.Gamma or in the flattened C_q. The results are the last nodes
 N_NODES, N_ROWS, N_TERMS, N_RESULTS, N_SIZES = range(5)
 
 

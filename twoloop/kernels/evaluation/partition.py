@@ -38,7 +38,7 @@ from twoloop.kernels.linalg.markowitz_lu import (
 
 RANK_TOLERANCE = 1e-11  # a pivot, or the ratio of the smallest to the largest pivot, counts as zero up to this limit
 PARTITION_CHANGED = -1  # return code: the task succeeded, as for DONE, and the partition has changed
-MAX_ROWS_ELIMINATED = 200  # with more independent rows than this, `min_pivot_ratio` returns the last pivot to save time
+MAX_ROWS_ELIMINATED = 200  # with more independent rows than this, `min_pivot_ratio` returns w.pivot to save time
 # a partition is poor if the sensitivity of dependent to independent coordinates exceeds its first value by this factor
 SENSITIVITY_GROWTH = 3.0
 

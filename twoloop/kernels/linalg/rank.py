@@ -11,7 +11,7 @@ from numba import types
 from twoloop.kernels.data.common import INTEGERS, MATRIX, VECTOR, compiled, f8, i8, kernel, merged
 from twoloop.kernels.linalg.dense import copy_matrix, largest_of, ldl_factor, ldl_solve, ldl_solve_rows
 
-ROUNDING_OF_SQUARES = 4.0 * 2.0**-52  # rounding error of dot products of n rows, relative to n * (sum of their |row|^2)
+ROUNDING_OF_SQUARES = 4.0 * 2.0**-52  # rounding error of A A^T / (number of rows of A * sum of squared entries of A)
 REORTHOGONALISE_BELOW = 0.5  # a row is orthogonalised again if |orthogonal part|^2 is below this fraction of |row|^2
 
 
@@ -155,9 +155,9 @@ TINY = 1e-300  # replaces zero as a divisor
 # most DEPENDENT times its norm. If a row is neither independent nor dependent by these limits, or if the smallest
 # eigenvalue of the mass matrix M may be below SIMILAR_EIGENVALUES times the largest, `select_rows` decides for all rows
 SIMILAR_EIGENVALUES, INDEPENDENT, DEPENDENT = 1e-7, 1e-10, 1e-10
-# A redundant row is a linear combination of independent rows, all scaled to norm 1. It replaces an independent row if
-# the coefficient of this row exceeds MAX_COEFFICIENT. Then the independent rows are farther from becoming dependent,
-# as rows do at dead centres. Coefficients of 1, which are common, must not cause exchanges
+# A redundant row is a linear combination of independent rows, all scaled to norm 1. If the
+# coefficient of an independent row exceeds MAX_COEFFICIENT, the redundant row replaces this row. So independent rows
+# are less likely to become dependent, for example at dead centres. Coefficients of 1, which are common, exchange none
 MAX_COEFFICIENT = 1.5
 TIE_RATIO = 1.01  # coefficients count as equal up to this ratio, so that rounding errors do not choose among them
 ZERO_ENTRY = 1e-12  # entries up to this fraction of the largest in their row count as zero: they may be rounding errors
@@ -436,7 +436,7 @@ def _mark_independent_rows(G, min_sine, basis, factors, coefficients, C, kept, i
 
 @kernel(i8(MATRIX, MATRIX, f8, f8, VECTOR, VECTOR, INTEGERS), vectorized=True)
 def choose_rows(original_mass, G, min_sine, weak_ratio, bounds, workspace, chosen):
-    """Choose the independent rows of G, and rows g for which M + sum s g^T g is invertible (M: `original_mass`).
+    """Choose independent rows of G, and rows g that make M = `original_mass` invertible if s g^T g is added (s > 0).
 
     Rows of G are selected by limits (see INDEPENDENT) or by `select_rows`, then exchanged by `_exchange_rows`. Rows g
     are chosen if weak_ratio > 0 and M has eigenvalues below `weak_ratio` times the largest. Return the index of the

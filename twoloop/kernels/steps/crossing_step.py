@@ -41,7 +41,7 @@ MAX_LEFT_OUT_NODES = 9  # a step fails if more nodes than this are left out
 # and BASE the time (s) of its argument `base`. BEGIN, DURATION and END store the beginning, duration and end (s) of the
 # polynomial that the last converged attempt computed; if there is none, END contains -inf
 LARGEST_PIVOT, EARLIEST, MAY_APPROACH, NODE_DISTANCE, BASE, BEGIN, DURATION, END, N_STORED = range(9)
-SHORTEST_PIECE, LONGEST_PIECE = 0.05, 0.2  # limits of the steps along a polynomial, relative to its duration
+SHORTEST_PIECE, LONGEST_PIECE = 0.05, 0.2  # least and largest step along a polynomial, relative to its duration
 NODE_GAP = 0.0767  # longest time between two successive nodes, relative to the duration of the polynomial
 BACKWARD_FRACTION = 0.4  # largest part of the polynomial that precedes the step, relative to its whole duration
 ORDER, ERROR_FACTOR = 12.0, 0.5  # the error estimate has the factor ERROR_FACTOR, and is about proportional to h^ORDER
@@ -172,8 +172,8 @@ def _choose_partition_at_end(
     """Set (q1, v1) to the end (at time t) of the polynomial of duration h; choose the partition there; return a code.
 
     The code is SINGULAR if the pivot at the end is below `min_pivot`, and below FAR_END times the run's largest pivot:
-    the end is too near the singular position, or before it. If MAY_APPROACH is 0, `min_pivot` is raised at least to the
-    pivot at the node LATE, and to END_MARGIN times `min_node_pivot`, the pivot below which nodes are left out.
+    the end is too near the singular position, or before it. If MAY_APPROACH is 0, two values replace `min_pivot` if
+    larger: the pivot at the node LATE, and END_MARGIN times the pivot `min_node_pivot`, below which nodes are left out.
     """
     A, AA, b, bA, c = tables
     if stored[MAY_APPROACH] == 0.0:
@@ -202,7 +202,7 @@ def _fill_integral_weights(b, c, c0, weights_v, weights_q):
 
 @merged
 def _set_beginning_state(h, c0, weights_v, weights_q, a, q, v, q_0, v_0):
-    """Set (q_0, v_0) to the state at the beginning of the polynomial; (q, v) is its state at the time c0 h later."""
+    """Set (q_0, v_0) to the first state of a polynomial of duration h; (q, v): its state at the time c0 h."""
     sum_rows(weights_v, a, v_0)
     sum_rows(weights_q, a, q_0)
     for m in range(q.size):
@@ -356,7 +356,7 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
             if chooses_nodes:
                 code = renew_partition(f, w, time, q_stage)
                 kept[j] = j
-                if code == DONE:  # this pivot may be the largest of the run, if the start was near a singular position
+                if code == DONE:  # this stage may have the run's largest pivot, if the start was near-singular
                     stored[LARGEST_PIVOT] = largest_pivot = max(largest_pivot, w.pivot)
                 if is_estimated and (code != DONE or w.pivot < min_node_pivot * largest_pivot):
                     kept[j], n_kept, code = -1.0, n_kept - 1, DONE
@@ -399,7 +399,7 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
             has_converged = True
             break
         _set_beginning_state(duration, c_base, weights_v, weights_q, a, q_base, v_base, q_0, v_0)
-        # test the pivot at the end already after two sweeps: the end is accurate enough, and most failures occur here
+        # already after two sweeps, test the pivot at the end: q is accurate enough, and this test finds most failures
         if sweep == 1 and is_estimated:
             min_pivots = MIN_PIVOT_RATIO * pivot, min_node_pivot * largest_pivot
             code = _choose_partition_at_end(f, w, t + h, duration, stored, *min_pivots, tables, a, *states)
@@ -418,7 +418,7 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
     code = _choose_partition_at_end(f, w, t + h, duration, stored, *min_pivots, tables, a, *states)
     if code != DONE:
         return Attempt(code, np.inf, 0.0)
-    if is_estimated:  # the next steps follow this polynomial
+    if is_estimated:  # the step has variable size: repeat it along this polynomial
         stored[BEGIN], stored[DURATION], stored[END] = begin, duration, t + h
         return Attempt(DONE, REPEAT_FACTOR, REPEAT_FACTOR)
     copy(q1, q_stage)

@@ -257,8 +257,8 @@ def newton_step(f, w, options, memory, t, h, tolerances, state, new_state):
     node = middle_node(c)
     while True:
         if memory[at.HAS_JACOBIAN] == 0.0:
-            # compute derivatives at the middle stage: its stiff directions differ least from those at other stages.
-            # Between stages, a short force that acts at no stage might change the derivatives
+            # compute derivatives at the middle stage, whose stiff directions differ least from those at other stages.
+            # At a time between stages, a short force that acts at no stage might change these derivatives
             dt = node * h
             for m in range(n):
                 q_mid[m] = q[m] + dt * (v[m] + 0.5 * dt * a[m])

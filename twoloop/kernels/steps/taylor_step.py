@@ -57,14 +57,14 @@ GROUPS, FIRST, SECOND, N_TABLE = 0, 1, 7, 13
 # expression, three of them have the quantity (COLUMN) and factor (COEFFICIENT) of its first term, and its CONSTANT. For
 # each other term, the other three have its expression (ROW), quantity (MORE_COLUMN) and factor (MORE_COEFFICIENT)
 COLUMN, COEFFICIENT, CONSTANT, ROW, MORE_COLUMN, MORE_COEFFICIENT, N_SUMS = range(7)
-SUM_INDICES = N_SUMS  # seventh array of ROWS and BALANCE: index of the equation that each affine expression belongs to
+SUM_INDICES = N_SUMS  # a seventh array, if each expression belongs to an equation: index of its equation
 # the series program is a list of arrays; its four parts begin at these indices. EARLY: operations on t and q only.
 # LATE: operations on t, q and v. ROWS, BALANCE: affine expressions for G v + (C_t, b) and Q - G^T lam - M a
 EARLY, LATE, ROWS = 0, N_TABLE, 2 * N_TABLE
 BALANCE, N_ARRAYS = ROWS + N_SUMS + 1, ROWS + 2 * (N_SUMS + 1)
-# columns of the array GROUPS, which has a row for each group of operations. KIND: kind of operation. BEGIN and END:
-# where the operations begin and end. MORE_FIRST and the next column: where terms of first arguments begin and end in
-# MORE_COLUMN. MORE_SECOND and the next column: where terms of second arguments begin and end in MORE_COLUMN
+# columns of the array GROUPS, which has a row for each group of operations. KIND: kind of operation. Three
+# ranges follow, each from an index up to another one. BEGIN, END: range of the operations. MORE_FIRST and the next
+# column: range of terms of first arguments in the array MORE_COLUMN. MORE_SECOND: the same for second arguments
 KIND, BEGIN, END, MORE_FIRST, _, MORE_SECOND, _, N_GROUP = range(8)
 
 # indices of the scalars in `memory`. Two Taylor series of q (ORDER + 1, n_q each) and arrays (`array_views`) follow.
@@ -77,9 +77,9 @@ KIND, BEGIN, END, MORE_FIRST, _, MORE_SECOND, _, N_GROUP = range(8)
     ALLOWED_SIZE,  # largest step size that the series about the beginning of the step allows, in units of UNIT
     NEXT_ALLOWED_SIZE,  # largest step size that the series about the end of the last attempt allows, in NEXT_UNIT
     TRIED,  # 1: the last attempt has computed the series about its end, where the next step may begin; 0: it has not
-    PASSED,  # time (s) from the expansion point of the series to the step; 0 unless steps share the series (KEEP = 1)
+    PASSED,  # time (s) from the series' expansion point to the step's beginning; 0 unless steps share a series (KEEP 1)
     TARGET,  # index (0 or 1) of the stored series that `compute_coefficients` overwrites
-    # step sizes are multiplied by this factor (at most 1), so that steps end near the constraints; 0: unknown
+    # steps are shortened by this factor (at most 1): longer ones would end too far from the constraints; 0: unknown
     DISTANCE_FACTOR,
     ATTEMPTS,  # number of attempts; it determines at which times within a step the defect is evaluated
     SUSPECTED,  # 1: memory[SUSPECT] contains a time that the run has not passed yet; 0: SUSPECT has no meaning
@@ -149,8 +149,8 @@ def _fill_arguments(options, sums, groups, g, more, values, out):
     """Compute the first or the second arguments of all operations of a group; store these arguments in `out`.
 
     Arguments are affine expressions in `values`, the Taylor coefficients of one order of all quantities; constants are
-    left out, as they belong to order 0. `sums`: index of the arrays of the expressions. `g`: index at which the group's
-    row begins in `groups`. `more`: MORE_FIRST for first arguments, MORE_SECOND for second ones.
+    left out, as they belong to order 0. `sums`: index of the first of the arrays of these expressions (COLUMN).
+    `g`: index at which the group's row begins in `groups`. `more`: MORE_FIRST for first arguments, MORE_SECOND for second ones.
     """
     column, coefficient = _integer_array(options, sums + COLUMN), _float_array(options, sums + COEFFICIENT)
     for o in range(groups[g + BEGIN], groups[g + END]):
@@ -163,7 +163,7 @@ def _fill_arguments(options, sums, groups, g, more, values, out):
 
 @merged
 def _store_sums(options, sums, scale, values, out):
-    """Store in `out` the values of the expressions ROWS or BALANCE (`sums`), multiplied by `scale`; omit constants."""
+    """Store G v + (C_t, b) (`sums`: ROWS) or Q - G^T lam - M a (BALANCE), times `scale`, in `out`; omit constants."""
     column, coefficient = _integer_array(options, sums + COLUMN), _float_array(options, sums + COEFFICIENT)
     indices = _integer_array(options, sums + SUM_INDICES)
     for o in range(column.size):
@@ -219,7 +219,7 @@ def start_operations(options, table, values, z, x, y):
 
 @merged
 def _next_coefficients(options, table, K, values, z, x, y, x0, y0, total):
-    """Store the Taylor coefficients of order K > 0 of operations: of their results z and two auxiliary series x and y.
+    """Store the Taylor coefficients of order K > 0 of operations' results z, and of their auxiliary series x and y.
 
     `table`, x, y: see `start_operations`. x0, y0: order 0 of x and y. `total`: result of `sum_of_products` for order K.
     In a PENDING product, the term with coefficient K of the second factor, which is not known yet, is left out.
