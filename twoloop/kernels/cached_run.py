@@ -207,7 +207,7 @@ RUN_ARRAYS.add_function("advance", i8(KIT, WORK, *(VECTOR,) * 9, MATRIX, MATRIX,
 ) = range(18)
 # indices in `expected`, which lists the constraint rows that generated code uses (empty without generated code)
 (
-    BOUND,  # index of the pivot limit in MIN_PIVOTS (generate/elimination.py), or OF_PYTHON if Python must choose rows
+    BOUND,  # index in MIN_PIVOTS (generate/elimination.py) of the code's pivot limit; OF_PYTHON: Python must choose rows
     N_ROWS,  # number of independent rows
     N_ADDED,  # number of rows g that are added to a singular M as s g^T g
     FIRST_ROW,  # index where the list of independent rows begins; the list of rows g, added to M as s g^T g, follows

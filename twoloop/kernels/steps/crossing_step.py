@@ -187,7 +187,7 @@ def _choose_partition_at_end(
 
 @compiled
 def _fill_integral_weights(b, c, c0, weights_v, weights_q):
-    """Store weights (S) that yield a polynomial's integral and double integral, 0 to c0, from its values at nodes c."""
+    """Store weights (S) that yield a polynomial's integrals, once and twice from 0 to c0, from its values at nodes c."""
     weights_v[:] = 0.0
     weights_q[:] = 0.0
     for i in range(S):

@@ -150,7 +150,7 @@ def _fill_arguments(options, sums, groups, g, more, values, out):
 
     Arguments are affine expressions in `values`, the Taylor coefficients of one order of all quantities; constants are
     left out, as they belong to order 0. `sums`: index of the first of the arrays of these expressions (COLUMN).
-    `g`: index at which the group's row begins in `groups`. `more`: MORE_FIRST for first arguments, MORE_SECOND for second ones.
+    `g`: index at which the group's row begins in `groups`. `more`: MORE_FIRST or MORE_SECOND.
     """
     column, coefficient = _integer_array(options, sums + COLUMN), _float_array(options, sums + COEFFICIENT)
     for o in range(groups[g + BEGIN], groups[g + END]):
@@ -342,7 +342,7 @@ def compute_coefficients(f, w, options, memory, t, state, unit):
     """Compute the Taylor series about `state` at t, with the unit of time `unit` (s); return DONE or NOT_FINITE.
 
     The result overwrites the stored series with the index memory[TARGET]. The linear system of each order is solved
-    with the factors that w has from the accelerations at this state.
+    with the factors in w, which were computed for the accelerations at this state.
     """
     n, n_rows, order = w.Q.size, w.Rate.size, int(options[ORDER])
     N, X1, Y1, X2, Y2, total1, total2, r, c = array_views(options, memory, n, n_rows)
