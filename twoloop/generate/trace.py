@@ -341,7 +341,7 @@ class Equations:
         return kind not in self.system.given and kind in ("jacobian", *GAMMA_SOURCES)
 
     def _trace_callback(self, kind: str, v: Sequence[Affine]) -> Any:
-        """Run a callback on symbols and return its result as expressions; if the system has no such callback, zeros."""
+        """Run a callback on symbols and return its result as expressions; return zeros if there is no such callback."""
         system, graph, (out,) = self.system, self.graph, self.system.arrays_of(kind)
         out, shape, p = out.astype(object), out.shape, self.parameters.copy()
         arrays = [symbol_array({"q": self.q, "v": v}[name]) for name in KINDS[kind].state]
@@ -476,7 +476,7 @@ class TraceCache:
             scales, indices, products = self._scaled_products(array)
             with np.errstate(all="ignore"):
                 values: Array = scales * np.array(list(map(product, products)))[indices]
-            if not np.isfinite(values).all():  # for example by division by a sum of parameters that is 0
+            if not np.isfinite(values).all():  # for example after a division by a sum of parameters that is 0
                 raise Untraceable("a number of them is not finite for these parameters")
             return values
 
@@ -628,7 +628,7 @@ class ParameterArrays:
         return numbers.reshape(exprs.shape)
 
     def write(self, product: Callable[[Powers], Any]) -> None:
-        """Store values for new parameters in the arrays that `array` returned; `product`: see `product_evaluator`."""
+        """Store values for new parameters in the arrays from `array`; `product`: see TraceCache.product_evaluator."""
         if self._gathered_products is None:
             return
         products, scales, product_indices = self._gathered_products

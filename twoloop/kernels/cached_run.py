@@ -203,11 +203,11 @@ RUN_ARRAYS.add_function("advance", i8(KIT, WORK, *(VECTOR,) * 9, MATRIX, MATRIX,
     EVALUATES_WITHIN,  # 1: the method adds evaluations within long steps; 0: it does not, which limits the step size
     NEAR_PIVOT,  # Python must check a run if, at an output time, (smallest / largest pivot of C_q) is below this
     MAX_CHANGE_RATIO,  # velocities jump in a step if max|change| > this * (step size) * (smaller max|a| of both ends)
-    MIN_SAMPLES,  # Python must check a run if two sudden changes of a force, C_t or b are under this many samples apart
+    MIN_SAMPLES,  # Python must check a run if two sudden changes of a force, C_t or b are closer than this many samples
 ) = range(18)
 # indices in `expected`, which lists the constraint rows that generated code uses (empty without generated code)
 (
-    BOUND,  # index in MIN_PIVOTS (generate/elimination.py) of the code's pivot limit; OF_PYTHON: Python must choose rows
+    BOUND,  # index in MIN_PIVOTS (generate/elimination.py) of the code's pivot limit; OF_PYTHON: Python chooses rows
     N_ROWS,  # number of independent rows
     N_ADDED,  # number of rows g that are added to a singular M as s g^T g
     FIRST_ROW,  # index where the list of independent rows begins; the list of rows g, added to M as s g^T g, follows

@@ -89,7 +89,7 @@ FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN, REACTION_BY_Q_GIVEN, MASS_VALUES_GIVEN = (
     WIDEST_GAP,  # longest time (s) between two evaluations of the equations within accepted steps
     LAST_JUMP,  # time (s) of the last known jump of a constraint rate (C_t, b); -infinite: none
     NEXT_JUMP,  # time (s) of the next known jump of a constraint rate (C_t, b), or end of the run; infinite: unknown
-    # largest |coefficient| of redundant rows as combinations of independent rows, when first checked; 0: not checked
+    # largest |coefficient| that expresses redundant rows by independent ones, at this partition's first check; 0: none
     MAX_COEFFICIENT,
     SMALLEST,  # fixed-order form: least sin^2 of a row's angle to the span of earlier rows of C_q; -1: M not definite
     TIME_IS_UP,  # 1 (set by another thread): the time limit has passed, and evaluations return STOPPED; 0: not yet

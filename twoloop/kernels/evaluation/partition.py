@@ -439,7 +439,7 @@ def restore_positions(f, w, t, q, v, tolerance, reuse_limit):
     """Solve C(t, q) = 0, eq. (15) of the paper, by Newton's method for the dependent positions in q; return a code.
 
     The iteration ends after a correction of at most `tolerance`. If this correction was larger than `reuse_limit`, the
-    Jacobian is evaluated and factored again at the final q; otherwise w keeps the Jacobian before the correction.
+    Jacobian is evaluated and factored again at the final q; otherwise w keeps the Jacobian from before this correction.
     The callback `kinematics`, if the user gave one, evaluates C, C_q and gamma (w.Gamma) together.
     """
     last_correction = np.inf
@@ -530,7 +530,7 @@ def restore_velocities(f, w, t, q, v, reuse_limit):
 
 @compiled
 def check_all_rows(f, w, t, q, v):
-    """Return DONE if the accepted state (q, v) satisfies all constraints, including redundant ones.
+    """Return DONE if the accepted state (q, v) satisfies all constraints, also redundant ones, else ROWS_CONTRADICT.
 
     If a constraint is violated by more than MAX_VIOLATION, store its index in w.contradiction; return ROWS_CONTRADICT.
     On entry, w.G must contain the Jacobian of all constraints at this state, and w.Rate the rates (C_t, b).

@@ -155,9 +155,9 @@ TINY = 1e-300  # replaces zero as a divisor
 # most DEPENDENT times its norm. If a row is neither independent nor dependent by these limits, or if the smallest
 # eigenvalue of the mass matrix M may be below SIMILAR_EIGENVALUES times the largest, `select_rows` decides for all rows
 SIMILAR_EIGENVALUES, INDEPENDENT, DEPENDENT = 1e-7, 1e-10, 1e-10
-# A redundant row is a linear combination of independent rows, all scaled to norm 1. If the
-# coefficient of an independent row exceeds MAX_COEFFICIENT, the redundant row replaces this row. So independent rows
-# are less likely to become dependent, for example at dead centres. Coefficients of 1, which are common, exchange none
+# A redundant row is a linear combination of independent rows, all scaled to norm 1. If the coefficient of an
+# independent row exceeds MAX_COEFFICIENT, the redundant row replaces this row. So independent rows are less likely to
+# become dependent, for example at dead centres. Coefficients of 1, which are common, must not cause exchanges
 MAX_COEFFICIENT = 1.5
 TIE_RATIO = 1.01  # coefficients count as equal up to this ratio, so that rounding errors do not choose among them
 ZERO_ENTRY = 1e-12  # entries up to this fraction of the largest in their row count as zero: they may be rounding errors
@@ -278,9 +278,9 @@ def _list_rows(is_kept, kept):
 def _exchange_rows(C, is_kept, kept):
     """Exchange independent rows with redundant rows, so that the independent ones are farther from dependence.
 
-    C[i, k] is the coefficient of independent row k in redundant row i, both scaled to norm 1. The rows are exchanged if
-    |C[i, k]| exceeds MAX_COEFFICIENT: this multiplies the volume that independent rows span by |C[i, k]|. Update C and
-    `is_kept` (1: independent, 0: redundant); store the indices of independent rows in `kept`, and return their number.
+    C[i, k] is the coefficient of independent row k in redundant row i, both scaled to norm 1. Two rows are exchanged if
+    |C[i, k]| exceeds MAX_COEFFICIENT. This multiplies the volume spanned by independent rows by |C[i, k]|. Update C
+    and `is_kept` (1: independent, 0: redundant). Store the indices of independent rows in `kept`; return their number.
     """
     n = len(C)
     n_kept = _list_rows(is_kept, kept)

@@ -187,7 +187,7 @@ def _choose_partition_at_end(
 
 @compiled
 def _fill_integral_weights(b, c, c0, weights_v, weights_q):
-    """Store weights (S) that yield a polynomial's integrals, once and twice from 0 to c0, from its values at nodes c."""
+    """Store weights (S) that yield a polynomial's integral and double integral (0 to c0) from its values at nodes c."""
     weights_v[:] = 0.0
     weights_q[:] = 0.0
     for i in range(S):
@@ -242,7 +242,7 @@ def _finish_piece(f, w, t, min_node_pivot, options, tolerances, stage, state, ne
     """Finish a step: project its end `stage` = [q, v, a], store it in `new_state`, and return an Attempt.
 
     If the smallest pivot is below `min_node_pivot`, or the projection fails, store the state without projection. If
-    `min_node_pivot` is 0, never do so, but return the code of a projection that fails.
+    `min_node_pivot` is 0, always project the state, and return the code of a projection that fails.
     """
     n = w.Q.size
     q, q1, v1 = state[:n], new_state[:n], new_state[n : 2 * n]
@@ -356,7 +356,7 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
             if chooses_nodes:
                 code = renew_partition(f, w, time, q_stage)
                 kept[j] = j
-                if code == DONE:  # this stage may have the run's largest pivot, if the start was near-singular
+                if code == DONE:  # a run that began near a singular position may have its largest pivot at this stage
                     stored[LARGEST_PIVOT] = largest_pivot = max(largest_pivot, w.pivot)
                 if is_estimated and (code != DONE or w.pivot < min_node_pivot * largest_pivot):
                     kept[j], n_kept, code = -1.0, n_kept - 1, DONE

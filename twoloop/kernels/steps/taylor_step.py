@@ -57,14 +57,14 @@ GROUPS, FIRST, SECOND, N_TABLE = 0, 1, 7, 13
 # expression, three of them have the quantity (COLUMN) and factor (COEFFICIENT) of its first term, and its CONSTANT. For
 # each other term, the other three have its expression (ROW), quantity (MORE_COLUMN) and factor (MORE_COEFFICIENT)
 COLUMN, COEFFICIENT, CONSTANT, ROW, MORE_COLUMN, MORE_COEFFICIENT, N_SUMS = range(7)
-SUM_INDICES = N_SUMS  # a seventh array, if each expression belongs to an equation: index of its equation
+SUM_INDICES = N_SUMS  # seventh array, if the expressions belong to equations: index of each expression's equation
 # the series program is a list of arrays; its four parts begin at these indices. EARLY: operations on t and q only.
 # LATE: operations on t, q and v. ROWS, BALANCE: affine expressions for G v + (C_t, b) and Q - G^T lam - M a
 EARLY, LATE, ROWS = 0, N_TABLE, 2 * N_TABLE
 BALANCE, N_ARRAYS = ROWS + N_SUMS + 1, ROWS + 2 * (N_SUMS + 1)
-# columns of the array GROUPS, which has a row for each group of operations. KIND: kind of operation. Three
-# ranges follow, each from an index up to another one. BEGIN, END: range of the operations. MORE_FIRST and the next
-# column: range of terms of first arguments in the array MORE_COLUMN. MORE_SECOND: the same for second arguments
+# columns of the array GROUPS, which has a row for each group of operations. KIND: kind of operation. BEGIN, END: the
+# range of the group's operations. MORE_FIRST and the next column: the range of first arguments' terms in the array
+# MORE_COLUMN. MORE_SECOND and the next column: the range of second arguments' terms
 KIND, BEGIN, END, MORE_FIRST, _, MORE_SECOND, _, N_GROUP = range(8)
 
 # indices of the scalars in `memory`. Two Taylor series of q (ORDER + 1, n_q each) and arrays (`array_views`) follow.
