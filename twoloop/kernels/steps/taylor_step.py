@@ -163,7 +163,7 @@ def _fill_arguments(options, sums, groups, g, more, values, out):
 
 @merged
 def _store_sums(options, sums, scale, values, out):
-    """Store `scale` times the known terms, without constants, of G v + (C_t, b) (ROWS) or Q - G^T lam - M a (BALANCE)."""
+    """Store `scale` times the known non-constant terms of G v + (C_t, b) (ROWS) or Q - G^T lam - M a (BALANCE)."""
     column, coefficient = _integer_array(options, sums + COLUMN), _float_array(options, sums + COEFFICIENT)
     indices = _integer_array(options, sums + SUM_INDICES)
     for o in range(column.size):
