@@ -133,12 +133,12 @@ FIRST_DEGREE = 3.0  # degree of the polynomial that predicts the accelerations i
 KAPPA = 0.02  # sweeps end if the estimated error of the iteration, relative to the tolerances, is at most this
 TARGET_SWEEPS = 6.0  # number of sweeps (iterations) in which a step should converge: the step size is chosen for this
 EXTRA_SWEEPS = 7  # a step is rejected if it has not converged after the target number of sweeps and this number more
-MAX_CONTRACTION = 0.8  # if changes by successive sweeps have at least this ratio in sweep 4 or later, reject the step
-MIN_RHO, MAX_RHO = 1e-3, 0.9  # the ratio rho of changes by successive sweeps is clipped to these bounds
-FAST_START, SLOW_START = 0.04, 0.3  # keep a guessed step size if change by sweep 2 / change by sweep 1 is in this range
-STAGNATION_RATIO = 0.5  # sweeps also end if a change of rounding size is at least this * the change by the sweep before
+MAX_CONTRACTION = 0.8  # from sweep 4 on, reject the step if change of v / change by the sweep before is at least this
+MIN_RHO, MAX_RHO = 1e-3, 0.9  # the ratio rho of changes of v by successive sweeps is clipped to these bounds
+FAST_START, SLOW_START = 0.04, 0.3  # keep a guessed step size if change of v by sweep 2 / by sweep 1 is in this range
+STAGNATION_RATIO = 0.5  # sweeps also end if the change of v is of rounding size and at least this * the previous change
 # with steps of fixed size, sweeps (iterations) end if the error of the iteration is at most KAPPA_OF_FIXED * tolerance,
-# if changes are below ROUNDING_OF_FIXED * |v| (v: velocities) and decay no more, or after MAX_SWEEPS_OF_FIXED
+# if changes of velocities v are below ROUNDING_OF_FIXED * |v| and do not decay, or after MAX_SWEEPS_OF_FIXED sweeps
 KAPPA_OF_FIXED, ROUNDING_OF_FIXED, MAX_SWEEPS_OF_FIXED = 1e-16, 1e-9, 60.0
 SMALLEST_RATIO = 1e-30  # added to (error of the iteration) / KAPPA before its logarithm is taken: the error may be 0
 ERROR_WEIGHT = 0.5  # the estimated error of a step is multiplied by this factor, see `_estimate_error`
@@ -185,7 +185,7 @@ class CollocationCode:
 
         if self.split_functions is None:
             programs = [*self.equations.accelerations, self.equations.position_projection, self.equations.projection]
-        else:  # the equations are split into functions, which `shared.digest` covers
+        else:  # the equations are split into functions, on which `shared.digest` already depends
             programs = self.equations.accelerations[:1]
         numbers = self.numbers
         description = [[each.sizes, *numbers.structure(each)] for each in programs]
@@ -472,7 +472,7 @@ class CollocationCode:
         builder.position_at_end(after)
 
     def _load_iterated(self, emit: LaneEmitter, pointer: Value) -> list[Value]:
-        """Return values at the nodes for each coordinate: loaded from `pointer` if it is iterated, otherwise 0."""
+        """Return values of all coordinates at the nodes: load those of iterated coordinates from `pointer`, else 0."""
         values = [emit.constant(0.0)] * self.n
         for k, i in enumerate(self.iterated_coordinates):
             values[i] = load_lanes(emit, pointer, LANES * k)
@@ -526,7 +526,7 @@ class CollocationCode:
         """Write code for the largest |deviation of accelerations from the equations| / limit, halfway between nodes.
 
         Return this ratio; INVALID if pivots are too small or accelerations are not finite. The limit is ALLOWED_DEFECT
-        * (tolerance of the velocity) / h. The code stores FACTOR_OF_DEFECT: the largest allowed (next h) / h.
+        * (tolerance of the velocity) / h, h: step size. The code stores FACTOR_OF_DEFECT: largest allowed (next h) / h.
         """
         builder, num, n = emit.builder, Emitter(emit.builder), self.n
         emit.numbers = emit.constants = numbers
@@ -690,7 +690,7 @@ class CollocationCode:
         store_lanes(emit, emit.builder.select(is_valid, before, emit.constant(0.0)), work, mem.VALID)
 
     def _integrate(self, emit: LaneEmitter, work: Value, state: Value) -> Value:
-        """Write code that integrates accelerations to v, q at nodes; return the largest |change of v| / tolerance."""
+        """Write code that integrates accelerations to v and q at nodes; return max |new v - old v| / tolerance of v."""
         num = Emitter(emit.builder)
         with loop_over_coordinates(emit, self.iterated_coordinates, [emit.constant(0.0)]) as (k, i, (largest,), new):
             before = load_lanes(emit, num.pointer(work, k * LANES), self.v_offset)

@@ -503,7 +503,7 @@ class DenseState:
         self.q, self.v = self._columns_by_time(rows[:, :n]), self._columns_by_time(rows[:, n:])
 
     def _columns_by_time(self, rows: Array) -> Array:
-        """Return `rows` (at ascending times) as columns ordered as `self.t`; if `self.t` is a number, the only row."""
+        """Return `rows` (in ascending time) as columns in the order of `self.t`; a vector if `self.t` is a number."""
         columns = np.empty(rows.shape[::-1])
         columns[:, self._order] = rows.T
         return columns if np.ndim(self.t) else columns[:, 0]

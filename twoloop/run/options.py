@@ -51,7 +51,7 @@ class Options:
 
     @cached_property
     def metadata(self) -> dict[str, Any]:
-        """Fields `method` and `rtol` of a result; if all steps test velocity errors, also `untested`, which is None."""
+        """Fields `method` and `rtol` of a result; also `untested: None` if all steps test velocity errors."""
         tested = getattr(self.method, "tested", "all")
         return {"method": self.method.name, "rtol": self.rtol} | ({} if tested == "positions" else {"untested": None})
 
@@ -62,7 +62,7 @@ class Options:
             run.set_step_sizes(self.first_step, self.max_step, t1)
 
 
-NO_CALL: Any = (None,) * 12, None  # used as (12 arguments, options) of the last call before any call is made
+NO_CALL: Any = (None,) * 12, None  # before the first call: stands for (12 arguments, options) of the last call
 
 
 def options_of(

@@ -100,7 +100,7 @@ class Dependence(NamedTuple):
 
     rank: int
     coefficients: dict[int, Array]  # for each dependent row: x (n_c,) with row = x @ C_q; x is 0 at dependent rows
-    allowed_move: Array  # random displacement (n_q,) that C_q allows; the largest entry is 1 unit of a coordinate
+    allowed_move: Array  # random displacement (n_q,) that C_q allows; max|entry / (unit of coordinate)| = 1
     project_nearby: Callable[[Array], Array | None]  # projects a position near q; returns None on failure
 
 
@@ -254,7 +254,7 @@ def consistent_state(
     keep : sequence of int, optional
         Coordinates whose position and velocity are not changed, such as a crank's. None: all may change.
     check_assembly : bool
-        Whether three other guesses, as far from the constraints as this one, must lead to the same assembly. False:
+        Whether three other guesses, up to twice as far from the constraints, must lead to the same assembly. False:
         accept the position that the projection finds.
 
     Returns
@@ -267,7 +267,7 @@ def consistent_state(
     ------
     TypeError, ValueError
         If a shape is wrong, a value is not finite, `keep` leaves too little freedom, or no consistent position is found
-        near the guess. Also if other guesses, as far away, lead to another assembly, usually near a dead centre.
+        near the guess. Also if a guess up to twice as far away leads to another assembly, usually near a dead centre.
 
     Examples
     --------
@@ -382,12 +382,12 @@ def _projected_position(
 def _describe_other_assembly(
     system: ConstrainedSystem, t: float, q1: Array, guess: Array, free: NDArray[np.intp], scales: Scales, cutoff: float
 ) -> str | None:
-    """Return a phrase about a guess, as far from q1 as `guess`, that may lead to another assembly; None: there is none.
+    """Project three guesses near the position q1; if one may end on another assembly, return how it ends, else None.
 
-    q1: projection of `guess`. A guess leads to the same assembly if its projection is near the point that C_q predicts
-    to first order, and the determinant of the dependent columns keeps its sign. If not, Newton's method starts from the
-    independent coordinates of q1 and the dependent ones of the projected guess. If this iteration does not lead back
-    to q1, there is another assembly.
+    q1 is the projection of `guess`. The three guesses are at most twice as far from q1 as `guess`. A guess leads to the
+    same assembly if its projection is near the point that C_q predicts to first order, and the determinant of the
+    dependent columns of C_q keeps its sign. If not, Newton's method starts from q1 with the dependent coordinates of
+    the projection. If this does not lead back to q1, there is another assembly.
     """
     scaled_move = (q1 - guess) / scales.columns
     largest_move = float(np.abs(scaled_move).max())
@@ -411,8 +411,8 @@ def _describe_other_assembly(
         expected = q1 + displacement + _least_change(jacobian, free, -(jacobian @ displacement), cutoff)
         if distance(projected, expected) <= MAX_NONLINEARITY * float(np.abs(move).max()) and sign_at(projected) == sign:
             continue
-        # `projected` is not near the prediction `expected`, perhaps only because constraints are curved. In this case,
-        # `mixed` (q1 with the dependent coordinates of `projected`) is projected to q1, otherwise to another assembly
+        # `projected` may be on another assembly, or constraints are only curved. If they are only curved, Newton's
+        # method leads from `mixed` back to q1. `mixed`: q1 with the dependent coordinates of `projected`
         mixed = q1.copy()
         mixed[dependent_columns] = projected[dependent_columns]
         mixed_projected, excess, _ = _gauss_newton(system, t, mixed, np.array(dependent_columns, dtype=int), cutoff)

@@ -345,7 +345,7 @@ class FunctionCopier:
         self.copies: dict[Any, Any] = {}  # replacements, by id of the original
 
     def replacement_of(self, value: Any, names: frozenset[str] = frozenset()) -> Any:
-        """Return `value` with helpers replaced if it is a helper, a tuple or a module (attributes `names` only)."""
+        """Replace a compiled helper, or helpers in a tuple or in a module's attributes `names`; return the result."""
         if self.is_copied(value):
             if id(value) not in self.copies:
                 self._add_copy(value)
@@ -357,7 +357,7 @@ class FunctionCopier:
         return value
 
     def is_copied(self, value: Any) -> bool:
-        """Return True for compiled helpers, which `replacement_of` then copies; derived classes may add values."""
+        """Return True for values that `replacement_of` copies: compiled helpers; in a derived class, all functions."""
         return isinstance(value, Dispatcher) or bool(jitable_templates(value))
 
     def _copy_module(self, module: types.ModuleType, names: frozenset[str]) -> types.ModuleType:

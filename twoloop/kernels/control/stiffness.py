@@ -62,7 +62,7 @@ URGENT_RATIO = 3.0  # a trial is urgent (cost cannot delay it) if step size * la
 MIN_COST_PER_COORDINATE = 64.0
 TRIAL_COST = 300.0  # approximate cost of a trial of the implicit method, in evaluations of the implicit method
 MIN_COST_IN_TRIALS = 3.0  # a trial begins only if urgent (URGENT_RATIO), or if run's cost / trial's cost exceeds this
-COUNTED_FRACTION_OF_RUN = 0.3  # in comparison with trials, a run's cost is at least this fraction of its expected total
+COUNTED_FRACTION_OF_RUN = 0.3  # compared with trials, a run's cost counts as at least this * its expected total cost
 # however small the largest rate is, a first trial begins when the run has cost as much as
 # COST_OF_ANY_TRIAL * MIN_COST_IN_TRIALS trials. After k trials, the next one begins at k + 1 times this cost
 COST_OF_ANY_TRIAL = 100.0
@@ -214,7 +214,7 @@ def _largest_rate(f, w, memory, t, state, new_state):
         growth_by_v = _power_iteration(f, w, t, state, by_v, True, Q, V, A)
         if growth_by_v * memory[H_MEAN] < NEGLIGIBLE_DAMPING:
             break
-    for m in range(n):  # a zero component could stay zero, and the motion of its coordinate would not be seen later
+    for m in range(n):  # a zero in the vector by_q or by_v could stay zero, and hide the motion of its coordinate
         if by_q[m] == 0.0:
             by_q[m] = ZERO_REPLACEMENT
         if by_v[m] == 0.0:
@@ -332,14 +332,14 @@ def _phase_to_begin(f, w, options, memory, tolerances, t, state, new_state):
         if not is_hidden:
             is_hidden = memory[RATE] > MIN_RATIO_TO_MOTION * _motion_rate(f, w, t, state, memory[RATE], Q, V, A)
     # if a run is costly, a trial begins even if the largest rate is small: friction is stiff only while it reverses, so
-    # that estimates may miss this time. As short first steps make the expected cost too large, require cost > min_cost
+    # that estimates may miss this time. Short first steps make the expected cost too large: so require cost > min_cost
     is_costly = is_cheap and cost > min_cost and counted > COST_OF_ANY_TRIAL * min_cost * (1.0 + memory[N_TRIALS])
     is_due = (
         h_rho > URGENT_RATIO or is_hidden or is_costly or (memory[N_ABOVE_LIMIT] >= options[N_ESTIMATES] and is_cheap)
     )
-    if is_cheap and h_rho <= 1.0:  # until a trial is cheap, N_ABOVE_LIMIT is kept, and may start a trial later
+    if is_cheap and h_rho <= 1.0:  # while a trial is not cheap, do not reset the count: it may start a trial later
         memory[N_ABOVE_LIMIT] = 0.0
-    is_expensive = cost_per_second > MIN_GAIN * memory[COST_PER_SECOND]  # more than with the explicit method
+    is_expensive = cost_per_second > MIN_GAIN * memory[COST_PER_SECOND]  # compared with a second by the explicit method
     if (memory[PHASE] == EXPLICIT and is_due) or (memory[PHASE] == IMPLICIT and (h_rho < RETURN_BELOW or is_expensive)):
         memory[COST_PER_SECOND] = cost_per_second
         memory[N_TRIALS] += 1.0

@@ -170,7 +170,7 @@ def solve_unknowns(f, w, n_corrections):
 
 @compiled
 def n_refinements(w):
-    """Return how many steps of iterative refinement (0, 1 or 2) solutions with the factors in w need."""
+    """Return the number of iterative refinements (0, 1 or 2) that solutions with the factors in w need."""
     smallest = w.smallest
     return 0 if smallest > REFINE_ONCE_BELOW else 1 if smallest > REFINE_TWICE_BELOW else 2
 
@@ -189,7 +189,7 @@ def _sine_to_independent_rows(f, w, row, square):
             x[columns[k]] += w.jacobian_values[k]
     solve_unknowns(f, w, 2)
     rows, columns, _ = mass_entries_of(f.ldl_program)
-    for k in range(rows.size):  # part = x^T M x: squared norm of the row's component orthogonal to independent rows
+    for k in range(rows.size):  # x^T M x (x: solution) is the squared norm of the row's part orthogonal to other rows
         part += x[rows[k]] * w.mass_values[k] * x[columns[k]]
     return np.sqrt(part / square) if square > 0.0 else 0.0
 
@@ -231,7 +231,7 @@ def _choose_rows(f, w, t, q):
 
 @compiled
 def _adopt_rows(w):
-    """Store the indices of the independent rows in w.rows_v; return DONE, or SINGULAR if the number of rows changes."""
+    """Store the indices of the independent rows in w.rows_v; return DONE, or SINGULAR if w.rows_v has another size."""
     if _count_independent(w.is_independent) != w.rows_v.size:
         return SINGULAR
     position = 0
@@ -263,7 +263,7 @@ def choose_rows(f, w, t, q):
 # sum of squares of column j of C_q
 REGULARIZATION = 1e-11
 CONVERGED_RESIDUAL = 1e-14  # multipliers are refined until (error of reactions) / (largest reaction) is at most this
-MAX_RESIDUAL = 1e-9  # if refinements help no more, (error of reactions) / (largest reaction) may be up to this
+MAX_RESIDUAL = 1e-9  # multipliers are rejected if (error of reactions) / (largest reaction) stays above this
 MAX_SOLUTIONS = 30  # largest number of refinements of the multipliers of least norm
 
 

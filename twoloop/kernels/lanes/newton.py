@@ -144,7 +144,7 @@ def _evaluate_middle_state(code, settings, control, c, work, new, a, memory):
 
 @merged
 def _smallest_size(control, n):
-    """Return the smallest atol / rtol, at most 1: smaller coordinates and velocities count as this size."""
+    """Return the smallest of 1 and all atol / rtol: the least size that is assumed for positions and velocities."""
     size = 1.0
     if control[at.RTOL] > 0.0:
         for j in range(n):
@@ -406,7 +406,7 @@ def solve_stages(code, settings, control, options, method_options, A, A2, c, wor
 
 @compiled
 def store_state_from_stages(settings, b, bA, work):
-    """Store in NEW the state at the time X (s) after the step begins; STAGES have weights b for v, bA = b A for q."""
+    """Store in NEW the state X (s) after the step begins, by STAGES with the weights b for v, and bA = b A for q."""
     n = settings[at.N]
     _, new, _, _, _, _, _, memory = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])
     s = b.size

@@ -61,7 +61,7 @@ class _PartSupports:
         self.lone_bodies = lone_bodies
         self.parts = _DisjointSets(n_bodies)
         self.is_grounded = [False] * n_bodies
-        self.hubs_by_part: list[set[int]] = [set() for _ in range(n_bodies)]  # index: smallest body of the part
+        self.hubs_by_part: list[set[int]] = [set() for _ in range(n_bodies)]  # [k]: hubs that support part k
         self.supported_bodies: dict[int, list[int]] = {hub: [] for hub in hubs}  # bodies of parts that a hub supports
 
     def can_eliminate(self, joint: int) -> bool:
@@ -341,7 +341,7 @@ def _update_runs(targets: Integers, diagonal: NDArray[np.bool_]) -> Integers:
 
 
 def _products_of_entries(rows: Integers, chosen: Sequence[int]) -> tuple[Integers, Integers, Integers]:
-    """For all products g_i g_j in g^T g, return the indices of the row g, of g_i and of g_j; g: a row in `chosen`."""
+    """For all products of two entries in one of the `chosen` rows, return the row and both indices in `rows`."""
     parts: list[tuple[Integers, Integers, Integers]] = [(rows[:0], rows[:0], rows[:0])]
     sequence = np.argsort(rows, kind="stable")
     sorted_rows = rows[sequence]
