@@ -275,7 +275,7 @@ def _tape_of(*numbers: float) -> ParameterTape:
 def apply_function(name: str, *arguments: Any) -> Any:
     """Call a function of NumPy or `math` by its name; the result is a Parameter if an argument is a Parameter."""
     name = NUMPY_NAMES.get(name, name)
-    if any(not issubclass(type(x), NUMBER_TYPES) for x in arguments):  # symbols have their own operators
+    if any(not issubclass(type(x), NUMBER_TYPES) for x in arguments):  # let symbols use their own operators
         return OPERATORS[name](*arguments)
     numbers = [x if type(x) is Parameter else float(x) for x in arguments]
     if not any(type(x) is Parameter for x in numbers):

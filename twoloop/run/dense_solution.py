@@ -341,7 +341,7 @@ class Interpolator:
     def _divide_intervals(
         self, table: StateTable, plan: Plan, kit: Any, numbers: Integers
     ) -> dict[float, tuple[Array, Array]]:
-        """Divide the intervals `numbers` (indices) into `plan.parts` steps, or fewer if steps fail.
+        """Divide each of the intervals `numbers` (indices) into `plan.parts` steps, or fewer if steps fail.
 
         Return a dict: the key is the time at which an interval begins, the value is its (times, states).
         """

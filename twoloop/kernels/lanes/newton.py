@@ -53,7 +53,7 @@ from twoloop.kernels.steps.velocity_errors import LONGEST_GAPS, SLOW_FACTOR, STE
     LARGEST_Q,  # largest correction of a stage's position by this iteration, divided by the square of the step size
     LARGEST_V,  # largest correction of a stage's velocity by this iteration, divided by the step size
     H_PREVIOUS,  # size (s) of the step whose accelerations are in PREVIOUS; 0: there is no such step
-    CONSTANT,  # 1: the predicted accelerations of all stages equal the accelerations at the beginning; else 0
+    CONSTANT,  # 1: the predicted accelerations of all stages equal those at the beginning of the step; else 0
     DURATION,  # time (s) until a velocity error changes its sign or decays, see velocity_errors.py; 0: not known
     N_SINGLE_VECTORS,
 ) = range(11)
@@ -326,7 +326,7 @@ def _correct_stages(settings, method_options, s, work):
 
 @merged
 def _raise_to_largest_value(work, target, begin, n):
-    """In each lane, raise the number at `target` to the largest |value|, or a NaN, in the n vectors at `begin`."""
+    """In each lane, raise the number at `target` to max|value| of the n vectors at `begin`; NaN if a value is NaN."""
     for i in range(n * LANES):
         magnitude, index = abs(work[begin * LANES + i]), target * LANES + i % LANES
         if magnitude > work[index] or magnitude != magnitude:
@@ -442,7 +442,7 @@ def _store_embedded_estimate(settings, method_options, A, work, memory):
         total += e[i]
     for i in range(n * LANES):
         work[e_q * LANES + i] = (gamma0 + total) * work[begin * LANES + i]
-    for j in range(s):  # the change of v until stage j is H sum_k A_jk a_k: add its product with the weight e_j
+    for j in range(s):  # add to E_Q the change of v until stage j, H sum_k A_jk a_k, with the weight e_j
         sum_rows(A[j], stage_rows, vector_range(work, sums, n))
         for i in range(n * LANES):
             work[e_q * LANES + i] += e[j] * work[at.H * LANES + i % LANES] * work[sums * LANES + i]
@@ -605,7 +605,7 @@ def _store_stages(work, memory, n, s):
 
 @kernel(STEP, vectorized=True)
 def step_by_newton(code, settings, control, options, work, status, n_steps, within):
-    """Take a step of an implicit Runge-Kutta method in each lane; its largest size is control[GAP] (s).
+    """Take a step of an implicit Runge-Kutta method in each lane, at most as long as control[GAP] (s).
 
     If `within`, take no step: compute the states at the time X (s) after the beginning of the last accepted step.
     """
