@@ -62,7 +62,7 @@ URGENT_RATIO = 3.0  # a trial is urgent (cost cannot delay it) if step size * la
 MIN_COST_PER_COORDINATE = 64.0
 TRIAL_COST = 300.0  # approximate cost of a trial of the implicit method, in evaluations of the implicit method
 MIN_COST_IN_TRIALS = 3.0  # a trial begins only if urgent (URGENT_RATIO), or if run's cost / trial's cost exceeds this
-COUNTED_FRACTION_OF_RUN = 0.3  # compared with trials, a run's cost counts as at least this * its expected total cost
+COUNTED_FRACTION_OF_RUN = 0.3  # when a trial is considered, a run's cost counts as at least this * its expected total
 # however small the largest rate is, a first trial begins when the run has cost as much as
 # COST_OF_ANY_TRIAL * MIN_COST_IN_TRIALS trials. After k trials, the next one begins at k + 1 times this cost
 COST_OF_ANY_TRIAL = 100.0

@@ -406,7 +406,7 @@ def solve_stages(code, settings, control, options, method_options, A, A2, c, wor
 
 @compiled
 def store_state_from_stages(settings, b, bA, work):
-    """Store in NEW the state X (s) after the step begins, by STAGES with the weights b for v, and bA = b A for q."""
+    """Store in NEW the state X (s) after the step begins: STAGES are summed with weights b for v, bA = b A for q."""
     n = settings[at.N]
     _, new, _, _, _, _, _, memory = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])
     s = b.size
