@@ -341,7 +341,7 @@ def _update_runs(targets: Integers, diagonal: NDArray[np.bool_]) -> Integers:
 
 
 def _products_of_entries(rows: Integers, chosen: Sequence[int]) -> tuple[Integers, Integers, Integers]:
-    """For each product of two entries in one of the `chosen` rows, return the row, and the entries' indices in `rows`."""
+    """For each product of two entries in one of the `chosen` rows, return the row, and their indices in `rows`."""
     parts: list[tuple[Integers, Integers, Integers]] = [(rows[:0], rows[:0], rows[:0])]
     sequence = np.argsort(rows, kind="stable")
     sorted_rows = rows[sequence]
