@@ -98,7 +98,7 @@ class ParameterTape(SymbolicObject):
             self.parameters[i] = Parameter(float(values[i]), self, 1.0, ((i, 1.0),))
 
     def atom(self, definition: Any) -> Powers:
-        """Return a sum or function of numbers as Powers; `definition`: ("sum", terms) or (function's name, arguments)."""
+        """Return a sum or function as Powers; `definition`: ("sum", terms) or (function's name, arguments)."""
         if definition not in self._atom_indices:
             self._atom_indices[definition] = len(self.atoms)
             self.atoms.append(definition)
