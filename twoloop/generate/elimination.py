@@ -55,10 +55,10 @@ MIN_PIVOTS = 10.0 ** np.arange(-2, -9, -1)  # possible PivotChoice.min_pivot; be
 # let p be the smallest relative pivot (see PIVOT_FRACTION) at a run's start. PivotChoice.min_pivot is MIN_PIVOTS[i]
 # for the first i with START_LIMITS[i] <= p, or MIN_PIVOTS[-1] if there is no such i
 START_LIMITS = MIN_PIVOTS[:-1] / PIVOT_FRACTION
-# M + s G^T G (s: scales of rows) is tried in place of M if PivotChoice.min_pivot would be MIN_PIVOTS[i] with i >= m. Up
-# to N_FEW_COORDINATES coordinates, m is MIN_INDEX_FEW or, if M is singular, MIN_INDEX_FEW_SINGULAR: two digits are lost
-# with Euler parameters even in sound models. With more coordinates, M + s G^T G makes the code much longer. Then m is
-# MIN_INDEX_MANY or, if M is singular, MIN_INDEX_MANY + 1
+# M + s G^T G (s: scales of rows) is tried in place of M if PivotChoice.min_pivot would be MIN_PIVOTS[i] with i >= m.
+# With at most N_FEW_COORDINATES coordinates, m is MIN_INDEX_FEW or, if M is singular, MIN_INDEX_FEW_SINGULAR: then even
+# sound models (with Euler parameters) lose two digits. With more coordinates, M + s G^T G makes the code much longer.
+# Then m is MIN_INDEX_MANY or, if M is singular, MIN_INDEX_MANY + 1
 N_FEW_COORDINATES = 24
 MIN_INDEX_FEW, MIN_INDEX_FEW_SINGULAR, MIN_INDEX_MANY = 4, 5, 6
 ADDED_SIZE = 16.0  # scales s are chosen so that the largest entry of s G^T G is about this * the largest entry of M
@@ -114,7 +114,7 @@ class DependentColumns:
 
     rows : indices of the independent rows of G.
     choose (field) : compiled function choose(G, *arguments), which stores pivot blocks and returns their number. None:
-        no coordinates are eliminated, as G has too few rows, or it is unknown which entries of G are constant.
+        there are fewer `rows` than MIN_ROW_RATIO * n_q, or it is unknown which entries of G are constant.
     """
 
     choose: Any = None
@@ -140,7 +140,7 @@ class DependentColumns:
 
 def _entry_kinds(system: ConstrainedSystem) -> Any:
     """Return the kinds of the entries of G (0: always zero, 1: constant, 2: varies), or None if they are unknown."""
-    if system.called_in_python:  # Python functions may store their arguments: do not call them with symbols yet
+    if system.called_in_python:  # Python functions may store their arguments: do not call them with symbols
         return None
 
     def find_kinds(equations: Callable[[], Equations]) -> Any:
@@ -199,7 +199,7 @@ class PivotChooser:
         return choice
 
     def _min_pivot_index(self, choice: PivotChoice, scales: Sequence[float], mass: Array, G: Array) -> int:
-        """Return the index in MIN_PIVOTS of min_pivot for M + s g^T g (g: rows `choice.added_rows` of G; s: `scales`).
+        """Return the index in MIN_PIVOTS of min_pivot if M + s g^T g (s: `scales`; g: `choice.added_rows`) replaces M.
 
         Return -1 if M + s g^T g is not positive definite, or if the independent rows differ from `choice.rows`.
         """
@@ -266,13 +266,13 @@ def _scale_factors(singular: Sequence[int], mass: Array, G: Array) -> Array:
     own /= np.maximum(rows.max(axis=1, initial=0.0), np.finfo(float).tiny) ** 2
     ratio = own / (np.abs(mass).max() / rows.max() ** 2)
     smaller = (ratio > 0.0) & ~rows[:, ~covered].any(axis=1)
-    # with + 0.25, the factor is 1 if `ratio` (light to heavy inertia) exceeds SCALE_STEP ** -1.25: this costs no digits
+    # with + 0.25, the factor is 1 if `ratio` (light / heavy inertia) is above SCALE_STEP ** -1.25: this loses no digits
     steps = np.ceil(np.log(np.where(smaller, ratio, 1.0)) / np.log(SCALE_STEP) + 0.25)
     return np.asarray(SCALE_STEP ** np.minimum(steps, 0.0))
 
 
 def _may_lose_digits(choice: PivotChoice, mass: Array, G: Array) -> bool:
-    """Return True if terms s g^T g added to M may cost digits: scales s differ, or the sum has a small pivot."""
+    """Return True if M + sum s g^T g (see PivotChoice) may cost digits: its scales s differ, or a pivot is small."""
     if not choice.added_rows:
         return False
     added, scales = G[list(choice.added_rows)], np.array(choice.scales)
@@ -347,7 +347,7 @@ class Elimination:
         return Program(self.graph, {"": []}, conditions)
 
     def _matrix(self) -> dict[tuple[int, int], Affine]:
-        """Return the nonzero entries of [M G^T; G 0], where G has only independent rows; for M, see PivotChoice."""
+        """Return the nonzero entries of [M G^T; G 0]: M plus terms of choice.added_rows, only independent rows of G."""
         n = self.system.n_q
         matrix = {(i, j): self.mass[i, j] for i in range(n) for j in range(n) if not is_zero(self.mass[i, j])}
         for i, j in matrix:

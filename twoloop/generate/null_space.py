@@ -73,7 +73,7 @@ class Factors:
     def _inverse(self, pivots: list[list[Affine]], own_pivots: list[Any]) -> list[list[Affine]]:
         """Return the inverse of a 1x1 or 2x2 pivot block, and append its pivots to `mass_pivots` or `conditions`.
 
-        `own_pivots`: for each row, the pivot if G had no other rows; None: its pivot is appended to `mass_pivots`.
+        `own_pivots`: None for rows whose pivots go to `mass_pivots`; for other rows, the pivot if G had no other row.
         """
         diagonal = [None if pivot is None else pivot.as_term() for pivot in own_pivots]
         a = pivots[0][0]
@@ -262,7 +262,7 @@ class DependentCoordinates:
             self._add_conditions(block, columns, pivot, solved)
 
     def check_length(self, n_following: int = 0) -> None:
-        """Raise ReductionFailed if the operations so far, and `n_following` more, are more than `max_added`."""
+        """Raise ReductionFailed if the operations recorded so far plus `n_following` exceed the limit `max_added`."""
         if len(self._graph.operations) + n_following > self._max_operations:
             raise ReductionFailed
 
@@ -314,7 +314,7 @@ class DependentCoordinates:
 def solve_reduced_system(
     mass: Any, force: Sequence[Affine], coordinates: DependentCoordinates
 ) -> tuple[list[Affine], list[tuple[Affine, Affine]]]:
-    """Return the accelerations a = g + T a_i (`coordinates`: T, g), where T^T M T a_i = T^T (Q - M g); `force`: Q.
+    """Return a = g + T a_i, where the independent accelerations a_i solve T^T M T a_i = T^T (Q - M g); `force`: Q.
 
     Also return pairs of expressions. If the first is larger than the second in each pair, T^T M T is not singular.
     """
@@ -344,7 +344,7 @@ def _pivot_conditions(matrix: dict[tuple[int, int], Affine], factors: Factors) -
         first_pivot: Affine | None = None
         for i in row_indices:
             pivot = next(pivots)
-            # the second pivot of a block, its determinant, is proportional to the first pivot: multiply `scale` by that
+            # the second pivot of a 2x2 block is its determinant: compare it with (first pivot) * (diagonal entry)
             scale = matrix[i, i] if first_pivot is None else first_pivot * matrix[i, i]
             first_pivot = pivot
             if pivot.terms:

@@ -153,7 +153,7 @@ class GrowthExponents(DegreeAlgebra):
 
 
 class DivisorDegrees(DegreeAlgebra):
-    """Algebra whose values are total degrees of divisors: a product adds the degrees, a sum takes the largest one.
+    """Algebra whose values are total degrees of the divisors in a quantity: products add them, sums take the largest.
 
     `degrees`: degrees of all quantities. Arctangents of x count as divisions by x: their derivative is x' / (1 + x^2).
     """

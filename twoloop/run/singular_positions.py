@@ -209,7 +209,7 @@ def singular_threshold(rtol: float) -> float:
 
 
 def velocity_rounding_errors(system: ConstrainedSystem, t: float, q: Array, v: Array, rank: int) -> Array:
-    """Estimate the errors (n_q,) of velocities due to rounding of positions; return NaN if callbacks fail near q."""
+    """Estimate errors (n_q,) of v due to rounding of q; infinity if C_q loses rank, NaN if callbacks fail near q."""
     rows = system.rows(t, q)
     left, values, right = np.linalg.svd(rows, full_matrices=False)
     errors = np.zeros(len(q))
@@ -225,7 +225,7 @@ def velocity_rounding_errors(system: ConstrainedSystem, t: float, q: Array, v: A
             row_slopes = np.abs(np.subtract(*(system.rows(t, each) for each in displaced)))
         except (ArithmeticError, ValueError):  # a square root, for example, fails beyond a dead centre
             return np.full(len(q), np.nan)
-        # estimate errors of C due to rounding of q with Jacobian entries near q: entries at q itself may be small
+        # entries of the Jacobian at q may be small: estimate errors of C, due to rounding of q, with entries near q
         nearby_rows = np.abs(rows) + (row_slopes * (np.abs(rows).max() / row_slopes.max()) if row_slopes.any() else 0.0)
         rounding = ROUNDING * np.sqrt((nearby_rows * nearby_rows) @ (q * q))
         errors = np.maximum(

@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 CHANGE_PER_SAMPLE = 3e-3  # finite differences in time use samples between which C_q changes by about this fraction
 # weights of five equidistant samples in finite differences; row 0: first derivative, row 1: second derivative
 WEIGHTS = np.array([[1.0, -8.0, 0.0, 8.0, -1.0], [-1.0, 16.0, -30.0, 16.0, -1.0]]) / 12.0
-# assumed relative error of finite differences: dC_q/dt counts as 0 if a displacement of max|q| changes C_q by less
+# assumed relative error of finite differences: dC_q/dt counts as 0 if a displacement of max|q| changes C_q less
 MAX_DIFFERENCE_ERROR = 1e-8
 # the rank of C_q rises along the motion if (ds/dt) / |dC_q/dt| exceeds this; s: a singular value, zero at the start
 MIN_RANK_DERIVATIVE = 1e-6
@@ -55,12 +55,12 @@ class Branch(NamedTuple):
 
 
 def branch_at(system: ConstrainedSystem, t: float, state: Array, rank: int, allowed: Array) -> Branch | bool | None:
-    """Find out whether a start is in a singular position; if so, return the Branch of the motion that leaves it.
+    """Return the Branch that leaves a singular start; None: the start is not singular; False: no branch is certain.
 
-    `state`: [q, v, a] at the start; `rank`: rank of C_q at the start. Return None if the start counts as not singular:
-    the rank does not rise along the motion, or C depends on t, or non-holonomic constraints exist. Return False if the
-    branch is not certain: velocities of another branch may be closer to v than the tolerances `allowed` (n_q,), or no
-    state on the branch was found.
+    `state`: [q, v, a] at the start; `rank`: rank of C_q at the start. The start counts as not singular if the rank does
+    not rise along the motion, if C depends on t, or if non-holonomic constraints exist. The branch is not certain if
+    velocities of another branch may be closer to v than the tolerances `allowed` (n_q,), or if no state on the branch
+    was found.
     """
     if system.n_a > 0 or "constraint_rate" in system.given or not 0 < rank < min(system.n_c, system.n_q):
         return None
@@ -129,5 +129,5 @@ def _branch_at(system: ConstrainedSystem, t: float, state: Array, rank: int, all
 
 
 def _time_of_change(change: float, speed: float, acceleration: float) -> float:
-    """Return the time (s) for a change of C_q by `change` |C_q|; `speed`, `acceleration`: |its derivatives| / |C_q|."""
+    """Return the time (s) in which C_q changes by `change` at this `speed` and `acceleration`, all relative to |C_q|."""
     return 2.0 * change / (speed + float(np.sqrt(speed * speed + 2.0 * acceleration * change)))

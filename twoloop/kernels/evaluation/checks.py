@@ -106,9 +106,9 @@ def linear_ranges(coordinates_in_units, radius, negligible, scratch, ranges):
     """Store in `ranges` how far coordinates can move, in their units, before each row of C_q changes much.
 
     Entry (i, j) of `coordinates_in_units` is |q_j| in its unit if row i of C_q has a nonzero entry j, else 0. `radius`:
-    norm of each row / change of the row per unit displacement. Let x be the largest |q_j| of a row. The range is the
-    radius if this is at most max(x, 1). For a larger radius, the range is the lower median of the |q_j| that exceed
-    NEGLIGIBLE * x; but if x is at most the argument `negligible`, the range is 1.
+    norm of each row / change of the row per unit displacement. Let x be the largest |q_j| of a row. If the radius is
+    at most max(x, 1), it is the range. If the radius is larger, the range is 1 where x <= `negligible`, otherwise the
+    lower median of the |q_j| that exceed NEGLIGIBLE * x.
     """
     for i in range(ranges.size):
         largest, n = 0.0, 0
@@ -130,7 +130,7 @@ def linear_ranges(coordinates_in_units, radius, negligible, scratch, ranges):
 # CONSISTENT: the state satisfies the constraints up to rounding. Only for a varying M, with L = roundings[2] max|M_ij|:
 # DEFINITE if all eigenvalues of M exceed L * EIGENVALUE_MARGIN; INDEFINITE if one is below L / EIGENVALUE_MARGIN
 WELL_FORMED, CONSISTENT, DEFINITE, INDEFINITE = 1, 2, 4, 8
-MAX_RELATIVE_DISTANCE = 0.5  # sizes recorded at a position p are used at q if all |q_j - p_j| are at most this * size_j
+MAX_RELATIVE_DISTANCE = 0.5  # recorded sizes of coordinates are used at q if all |q_j - recorded q_j| <= this * size_j
 ROUNDING_OF_ZERO = 2.0**-52  # a coordinate up to this fraction of the largest one may be zero with a rounding error
 EIGENVALUE_MARGIN = 2.0  # if the least eigenvalue of M is within this factor of its limit, a check in Python decides
 
@@ -174,7 +174,7 @@ def _is_symmetric(mass, tolerance):
 def _is_rounding_error(value, row, state, sizes, min_size, rate, tolerance):
     """Return True if `value`, the violation of a constraint, is at most `tolerance` times the sum of its |terms|.
 
-    The |terms| are |rate| and, for each j, |row[j]| times the largest of |state[j]|, sizes[j] and `min_size`.
+    The |terms| are |rate| (C_t, b, or 0) and, for each j, |row[j]| * max(|state[j]|, sizes[j], min_size).
     """
     sum_of_terms = abs(rate)
     for j in range(state.size):

@@ -58,7 +58,7 @@ LANES = 8 if has_wide_vectors() else 4  # number of runs at once: the number of 
     H_LIMIT,  # upper limit of step sizes (s), set by a failed step; infinity: no limit
     LIMIT_AGE,  # number of accepted steps since H_LIMIT was set
     JUMP_END,  # time (s) at the end of the last step that was rejected with an error above SUDDEN_ERROR
-    SHIFT,  # number from 0 to 1 that shifts the times of evaluations of the defect within a step
+    SHIFT,  # number from 0 to 1 that shifts the times within a step at which the defect is evaluated
     EVALUATED,  # number of evaluations within the step, in addition to settings[N_EVALUATIONS]
     DISPLACED,  # typical size of q (or v): finite differences displace smaller components as if they had this size
     LARGEST,  # largest |component| of q (or v), which finite differences displace
@@ -188,14 +188,14 @@ def add_product(work, target, x, y, sign):
 
 @merged
 def _raised_value(work, target, error, factor, before, after, atol, rtol):
-    """Return what `raise_to_ratio` stores in one lane; arguments that are offsets there are indices in `work` here."""
+    """Return the larger of work[target] and the ratio of `raise_to_ratio`; indices of `work` replace its offsets."""
     allowed_error = atol + rtol * max(abs(work[before]), abs(work[after]))
     return max(work[target], abs(work[error]) * work[factor] / allowed_error)
 
 
 @compiled
 def raise_to_ratio(work, target, error, factor, before, after, atol, rtol):
-    """In each lane, raise the number at `target` to the ratio of an error to its tolerance, if the ratio is larger.
+    """In each lane, store at `target` the ratio of an error to its tolerance, unless the number there is larger.
 
     The ratio is |error| * factor / (atol + rtol * max(|before|, |after|)); all names but atol and rtol are offsets.
     """

@@ -60,7 +60,7 @@ def _fill_stiffness(program, mass, jacobian, stiffness, scratch):
 
 @merged
 def fill_saddle_matrix(program, mass, jacobian, values, stiffness, scratch):
-    """Store in `values` the matrix [M G^T; G 0]; to a singular M, add s g^T g (g: row of G; s: `_fill_stiffness`)."""
+    """Store [M G^T; G 0] in `values`; if M is singular, add s g^T g for rows g of G, with s of `_fill_stiffness`."""
     for s in range(values.size):
         values[s] = 0.0
     _, _, slots = mass_entries_of(program)
@@ -82,8 +82,8 @@ def factor(program, is_independent, values, sizes, min_sine_square):
 
     The angle is between a row and the span of previous rows. Its squared sine is -pivot / (squared norm of the row).
     The squared norms are stored in `sizes`, 1 / pivot in the diagonal of the factors. On entry, `is_independent` is 0
-    for rows that count as redundant. It is set to 0 for rows with a squared sine of at most `min_sine_square`. Factors
-    leave out rows with 0. If a pivot of a coordinate is not positive (M not positive definite), return NOT_DEFINITE.
+    for rows that count as redundant. It is set to 0 for rows with a squared sine of at most `min_sine_square`. The
+    factors of rows with 0 are 0. If the pivot of a coordinate is not positive (M not definite), return NOT_DEFINITE.
     """
     (n_q, n) = program[N_COORDINATES], program[N_PIVOTS]
     order, runs = pivot_order_of(program), update_runs_of(program)

@@ -46,7 +46,7 @@ def newton_program(
     body_groups: Iterable[Sequence[int]],
     stiff_rows: Sequence[int],
 ) -> NDArray[np.int32] | None:
-    """Return the program that factors Newton's matrix; None if the program would be too long.
+    """Return the program that factors Newton's matrix; None if it has more updates than `program_in_order` allows.
 
     `tangents`: entries of K and D (derivatives of forces), in both triangles, as sorted by `grouped_entries`. For the
     other arguments see `factorization_program`.
@@ -82,7 +82,7 @@ def column_groups(entries: Entries, n_q: int) -> Integers:
 
 @inlined
 def tangent_entries_of(program):
-    """Return three arrays: row and column of each entry of K and D (force derivatives), and bounds of column groups."""
+    """Return rows and columns of the entries of K and D (force derivatives), and where groups of columns begin."""
     group_begins = program[end_of_sections(program) :]
     rows, columns, _ = mass_entries_of(program)
     n_mass = rows.size - group_begins[group_begins.size - 1]
@@ -117,7 +117,7 @@ def fill_newton_matrix(program, mass, jacobian, K, D, z, stiffness, values):
 
 @compiled
 def factor(program, is_independent, values, sizes):
-    """Replace the matrix in `values` by its factors L U (diagonal: 1/pivot); return False if a pivot is too small.
+    """Replace the matrix in `values` by factors L U (diagonal: 1/pivot); return False if a pivot is small (MIN_PIVOT).
 
     Redundant rows (0 in `is_independent`) have factors of 0, so that they do not affect solutions. `sizes` is scratch.
     """

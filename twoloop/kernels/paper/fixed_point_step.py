@@ -31,7 +31,7 @@ from twoloop.kernels.steps.stages import (
 
 @kernel(COMMIT)
 def commit_runge_kutta(f, w, options, memory, tolerances, accepted):
-    """If the attempted step was accepted, keep its stage accelerations and rounding errors for the next step."""
+    """If the attempted step was accepted, keep its stage accelerations and the rounding errors of q and v."""
     s, n = int(options[STAGES]), w.Q.size
     if accepted and memory[at.HAS_TRIAL] == 1.0:
         previous, trial = memory_block(memory, s, n, at.A_PREVIOUS), memory_block(memory, s, n, at.A_TRIAL)

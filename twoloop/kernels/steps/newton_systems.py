@@ -74,7 +74,7 @@ from twoloop.kernels.steps.stages import (
 
 MAX_ITERATIONS = 15  # largest number of Newton iterations: if they do not converge, the step fails
 EQUAL_STEP_TOLERANCE = 1e-9  # step sizes count as equal up to this relative difference, which rounding of times causes
-# rounding may prevent that corrections decrease to the tolerance of Newton's method. So the method has also converged
+# because of rounding, corrections may stay above the tolerance of Newton's method. So the method has also converged
 # if the last correction is at most this fraction of the smallest tolerance of the run
 MAX_ROUNDING_CORRECTION = 0.1
 
@@ -170,9 +170,9 @@ def _subtract_reaction_tangent(f, w, tolerances, t, q, moved, b, K):
 
 @compiled
 def fill_tangent_by_q(f, w, tolerances, t, q, v, b, moved, K, R):
-    """Store K (n_q, n_q), the derivative of the forces with reactions, Q - C_q^T lam, by q; only for |i - j| <= b.
+    """Store K (n_q, n_q), derivative of the forces with reactions, Q - C_q^T lam, by q: the entries with |i - j| <= b.
 
-    Return a code. The last evaluation must have been at (t, q, v). `moved` (n_q) and R (n_q, n_q) are scratch.
+    Return a code. The last evaluation must have been at (t, q, v). b: bandwidth. `moved` (n_q), R (n_q, n_q): scratch.
     """
     _clear_band(K, b)
     f.force_by_q(t, q, v, f.p, K)
@@ -189,7 +189,7 @@ def fill_tangent_by_q(f, w, tolerances, t, q, v, b, moved, K, R):
 
 @compiled
 def fill_tangent_by_v(f, t, q, v, b, D):
-    """If a callback gives dQ/dv (Q: forces), store its entries with |i - j| <= b in D; return DONE or NOT_FINITE."""
+    """Store dQ/dv (Q: forces; |i - j| <= b) in D if a callback gives it, else leave D; return DONE or NOT_FINITE."""
     if f.force_by_v_given == 0:
         return DONE
     _clear_band(D, b)
@@ -354,8 +354,8 @@ def _band_view(numbers, n, b):
 def _border_views(w, n, r, b):
     """Return three arrays that were stored together with K: independent rows of C_q, w.D, and dependent coordinates.
 
-    Sizes: (r, n), (n - r + 1, r), (r). w.D contains, transposed, the derivative of the dependent velocities by the
-    independent ones; its last row contains the dependent velocities due to C_t. The arrays follow the band of K.
+    Sizes: (r, n), (n - r + 1, r), (r), with r rows. w.D contains, transposed, the derivative of the dependent
+    velocities by the independent ones, then the dependent velocities due to C_t. The arrays follow the band of K.
     """
     numbers = matrix_storage(w, n, at.DERIVATIVE_Q)
     start = n * (2 * b + 1)
@@ -626,10 +626,10 @@ def _fill_sparse_residual(f, w, t, q, v, renews_G, out):
 
 @compiled
 def _fill_tangent_entries_by_differences(f, w, tolerances, t, q, v, by_v, base, residual, moved, entries):
-    """Store the `entries` of K (if `by_v`, of D), finite differences of the residual; return DONE or NOT_FINITE.
+    """Store the `entries` of K (of D if `by_v`), differences of the forces with reactions; return DONE or NOT_FINITE.
 
-    Columns of a group have no rows in common: one difference yields them all. `base`: residual at (t, q, v);
-    `residual` and `moved` (n_q): scratch.
+    Columns of a group have no rows in common: one difference yields them all. `base`: forces with reactions at
+    (t, q, v); `residual` and `moved` (n_q): scratch.
     """
     rows, columns, begins = tangent_entries_of(f.newton_program)
     base_point = v if by_v else q
@@ -731,7 +731,7 @@ def _factor_sparse_matrix(f, w, z, factors):
 
 @compiled
 def _fill_sparse_right_side(f, w, r, right):
-    """Store [M r; G r] in `right` (r: residual), plus s g^T g r for redundant rows g whose s g^T g is added to M."""
+    """Store [M r; G r] in `right` (r: residual); for each redundant row g, add s g^T g r if M contains s g^T g."""
     mass, jacobian, _, _, is_independent, stiffness = _sparse_derivative_views(f, w)
     right[:] = 0.0
     rows, columns, _ = mass_entries_of(f.newton_program)
@@ -827,7 +827,7 @@ def _solve_system(f, w, memory, s, index, numbers, substitute, X, x):
 
 @compiled
 def _solve_sparse_system(f, w, numbers, right, y, x):
-    """Replace x (n_q) by the solution of Newton's system, using the factors `numbers`; `right` and `y` are scratch."""
+    """Replace the residual x (n_q) by the solution of Newton's system; `numbers`: factors. `right`, `y`: scratch."""
     _fill_sparse_right_side(f, w, x, right)
     solve_lu(f.newton_program, numbers, right, y)
     copy(right[: x.size], x)
@@ -840,7 +840,7 @@ def solve_system(f, w, options, memory, s, k, x):
     If this eigenvalue is real, only the real part of x is used, and the solution is real.
     """
     n = w.Q.size
-    if k == 0 and options[newton_options_index(s) + at.N_REAL] > 0.0:  # the eigenvalue is real, as in `filter_error`
+    if k == 0 and options[newton_options_index(s) + at.N_REAL] > 0.0:  # a real eigenvalue: use `factor_filter`'s matrix
         real_part, X = vector(memory, s, n, at.V_MOVED), vector(memory, s, n, at.Q_MOVED)
         for i in range(x.size):
             real_part[i] = x[i].real
@@ -862,10 +862,10 @@ def solve_system(f, w, options, memory, s, k, x):
 
 @compiled
 def filter_error(f, w, options, memory, s, h, e_q, e_v):
-    """Remove stiff components from the velocity error e_v: e_v = (I - z^2 J_q - z J_v)^-1 (e_v + z J_q e_q).
+    """Remove stiff components from the velocity error e_v, with Newton's matrix and the position error e_q.
 
-    z: step size h times GAMMA0. J_q, J_v: derivatives of accelerations by q_i and v_i. The estimated errors of q and v
-    are the first n_dof entries of e_q and e_v (n_q each); the other entries are scratch.
+    Replace e_v by (I - z^2 J_q - z J_v)^-1 (e_v + z J_q e_q). z: h * GAMMA0. J_q, J_v: derivatives of accelerations by
+    q_i and v_i. Only the first n_dof entries of e_q and e_v (n_q each) are errors; the other ones are scratch.
     """
     m = w.independent.size
     if f.form == FIXED_ORDER:
