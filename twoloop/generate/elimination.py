@@ -11,7 +11,7 @@ matrices M and -G M^-1 G^T: none is zero.
 
 - If a row of G has a much smaller pivot than it would have without the other rows, this row nearly depends on the other
   rows, and the generated code reports that its results are invalid.
-- The same factors are used to compute the nearest position and velocity on the constraints, in the metric of M.
+- The factors of the matrix also yield the nearest position and velocity on the constraints, in the metric of M.
 - If M is singular, terms s g^T g are added to it: g are rows of G, and s is the scale of a row. In short, "rows are
   added to M". This changes neither accelerations nor projections.
 - If rows of G are redundant, the equations contain independent rows only.

@@ -129,5 +129,5 @@ def _branch_at(system: ConstrainedSystem, t: float, state: Array, rank: int, all
 
 
 def _time_of_change(change: float, speed: float, acceleration: float) -> float:
-    """Return the time (s) in which C_q changes by `change` at this `speed` and `acceleration`, all relative to |C_q|."""
+    """Return the time (s) in which C_q changes by `change` with `speed` and `acceleration`, all relative to |C_q|."""
     return 2.0 * change / (speed + float(np.sqrt(speed * speed + 2.0 * acceleration * change)))

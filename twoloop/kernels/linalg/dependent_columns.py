@@ -12,8 +12,8 @@ from twoloop.kernels.data.common import INTEGERS, MATRIX, VECTOR, compiled, i8, 
 NONE, NUMBER, VARIES = 0, 1, 2
 ROWS_SEARCHED = 4  # to save time, pivot blocks are sought only in this number of rows, which have the fewest entries
 # limits for a pivot block: three pairs, from strict to loose, are tried until a block meets both limits of a pair
-# - MAX_SQUARES: a block's equations express its coordinates by other coordinates; this limits the sum of squares of the
-#   coefficients of the other coordinates
+# - MAX_SQUARES: a block's equations express its coordinates by other coordinates. The squared coefficients in these
+#   equations must have a sum below this limit
 # - MIN_SINE_SQUARES: smallest squared sine of the angle between the columns of two pivots; for a single pivot, smallest
 #   squared ratio of the pivot to the norm of its column of G
 # With the first pair, pivots stay large for 98 % of a turn of a spatial four-bar, with the second for 34 %. The last

@@ -800,7 +800,7 @@ def factor_systems(f, w, options, memory, s, h):
     code = factor_filter(f, w, options, memory, s, h)
     offset += at.N_EIGEN_SCALARS + s
     for k in range(n_systems):
-        # if the first eigenvalue is real, it is GAMMA0, and `factor_filter` has already factorized the first matrix
+        # if the tableau's first eigenvalue is real, it is GAMMA0: `factor_filter` has already factorized its matrix
         if code == DONE and (k > 0 or n_real == 0):
             z = h * complex(options[offset], options[offset + 1])
             if f.form == FIXED_ORDER:
