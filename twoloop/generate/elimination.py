@@ -114,7 +114,7 @@ class DependentColumns:
 
     rows : indices of the independent rows of G.
     choose (field) : compiled function choose(G, *arguments), which stores pivot blocks and returns their number. None:
-        there are fewer `rows` than MIN_ROW_RATIO * n_q, or it is unknown which entries of G are constant.
+        no elimination if `rows` are fewer than MIN_ROW_RATIO * n_q, or if constant entries of G are unknown.
     """
 
     choose: Any = None
@@ -266,7 +266,7 @@ def _scale_factors(singular: Sequence[int], mass: Array, G: Array) -> Array:
     own /= np.maximum(rows.max(axis=1, initial=0.0), np.finfo(float).tiny) ** 2
     ratio = own / (np.abs(mass).max() / rows.max() ** 2)
     smaller = (ratio > 0.0) & ~rows[:, ~covered].any(axis=1)
-    # with + 0.25, the factor is 1 if `ratio` (light / heavy inertia) is above SCALE_STEP ** -1.25: this loses no digits
+    # with + 0.25, the factor is 1 if `ratio` (light / heavy inertia) is above SCALE_STEP ** -1.25: no digit is lost
     steps = np.ceil(np.log(np.where(smaller, ratio, 1.0)) / np.log(SCALE_STEP) + 0.25)
     return np.asarray(SCALE_STEP ** np.minimum(steps, 0.0))
 
@@ -347,7 +347,7 @@ class Elimination:
         return Program(self.graph, {"": []}, conditions)
 
     def _matrix(self) -> dict[tuple[int, int], Affine]:
-        """Return the nonzero entries of [M G^T; G 0]: M plus terms of choice.added_rows, only independent rows of G."""
+        """Return the nonzero entries of [M G^T; G 0]; M includes the terms of added_rows, G only independent rows."""
         n = self.system.n_q
         matrix = {(i, j): self.mass[i, j] for i in range(n) for j in range(n) if not is_zero(self.mass[i, j])}
         for i, j in matrix:

@@ -73,7 +73,7 @@ class Factors:
     def _inverse(self, pivots: list[list[Affine]], own_pivots: list[Any]) -> list[list[Affine]]:
         """Return the inverse of a 1x1 or 2x2 pivot block, and append its pivots to `mass_pivots` or `conditions`.
 
-        `own_pivots`: None for rows whose pivots go to `mass_pivots`; for other rows, the pivot if G had no other row.
+        `own_pivots`: None for rows whose pivot goes to `mass_pivots`; otherwise the row's pivot if G had no other row.
         """
         diagonal = [None if pivot is None else pivot.as_term() for pivot in own_pivots]
         a = pivots[0][0]
@@ -314,9 +314,9 @@ class DependentCoordinates:
 def solve_reduced_system(
     mass: Any, force: Sequence[Affine], coordinates: DependentCoordinates
 ) -> tuple[list[Affine], list[tuple[Affine, Affine]]]:
-    """Return a = g + T a_i, where the independent accelerations a_i solve T^T M T a_i = T^T (Q - M g); `force`: Q.
+    """Return the accelerations a = g + T a_i, where a_i is the solution of T^T M T a_i = T^T (Q - M g) (Q: `force`).
 
-    Also return pairs of expressions. If the first is larger than the second in each pair, T^T M T is not singular.
+    `coordinates`: T, g. Also return pairs of expressions: T^T M T is not singular if in each pair the first is larger.
     """
     n, T, g, independent = len(mass), coordinates.T, coordinates.g, coordinates.independent
     zero = Affine(mass[0, 0].graph, 0.0, {})

@@ -209,7 +209,7 @@ def singular_threshold(rtol: float) -> float:
 
 
 def velocity_rounding_errors(system: ConstrainedSystem, t: float, q: Array, v: Array, rank: int) -> Array:
-    """Estimate errors (n_q,) of v due to rounding of q; infinity if C_q loses rank, NaN if callbacks fail near q."""
+    """Estimate errors (n_q,) of v due to rounding of q: infinite if rank is lost at q, NaN if callbacks fail near q."""
     rows = system.rows(t, q)
     left, values, right = np.linalg.svd(rows, full_matrices=False)
     errors = np.zeros(len(q))

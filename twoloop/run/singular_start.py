@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 CHANGE_PER_SAMPLE = 3e-3  # finite differences in time use samples between which C_q changes by about this fraction
 # weights of five equidistant samples in finite differences; row 0: first derivative, row 1: second derivative
 WEIGHTS = np.array([[1.0, -8.0, 0.0, 8.0, -1.0], [-1.0, 16.0, -30.0, 16.0, -1.0]]) / 12.0
-# assumed relative error of finite differences: dC_q/dt counts as 0 if a displacement of max|q| changes C_q less
+# assumed relative error of differences: dC_q/dt counts as 0 if a displacement of max|q| changes C_q by less than this
 MAX_DIFFERENCE_ERROR = 1e-8
 # the rank of C_q rises along the motion if (ds/dt) / |dC_q/dt| exceeds this; s: a singular value, zero at the start
 MIN_RANK_DERIVATIVE = 1e-6

@@ -205,7 +205,7 @@ def _has_same_entries(rows, entries):
 
 @exact
 def _index_of_near_position(q, rows, n_c, records):
-    """Return where in `records` (see `evaluate_start`) a position near q with the pattern of `rows` begins; -1: none."""
+    """Return the index in `records` (see `evaluate_start`) of a position near q with the pattern of `rows`, or -1."""
     n = q.size
     stride = 2 * n + n_c * n
     for k in range(0, records.size, stride):

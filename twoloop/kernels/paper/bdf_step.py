@@ -156,10 +156,10 @@ def _corrector_coefficient(h, k):
 
 @compiled
 def _correct_state(f, w, options, t, c, prediction, rate, new_state, a_new):
-    """Solve the corrector's y = prediction + c (y' - rate) for the independent y = (q_i, v_i) at t; return a code.
+    """Solve the corrector's equation y = prediction + c (y' - rate) at time t for y = (q_i, v_i); return a code.
 
     The outer loop iterates on the independent accelerations. On return, `new_state` is [q, v, a, lam], and satisfies
-    the equations of motion and the constraints. c: `_corrector_coefficient`; rate: y' predicted; a_new: scratch.
+    the equations of motion and the constraints. c: `_corrector_coefficient`; rate: predicted y'; a_new: scratch.
     """
     n = w.Q.size
     q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]

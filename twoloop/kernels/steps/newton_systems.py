@@ -189,7 +189,7 @@ def fill_tangent_by_q(f, w, tolerances, t, q, v, b, moved, K, R):
 
 @compiled
 def fill_tangent_by_v(f, t, q, v, b, D):
-    """Store dQ/dv (Q: forces; |i - j| <= b) in D if a callback gives it, else leave D; return DONE or NOT_FINITE."""
+    """Store the band |i - j| <= b of dQ/dv (Q: forces) in D, if a callback gives it; return DONE or NOT_FINITE."""
     if f.force_by_v_given == 0:
         return DONE
     _clear_band(D, b)
@@ -354,7 +354,7 @@ def _band_view(numbers, n, b):
 def _border_views(w, n, r, b):
     """Return three arrays that were stored together with K: independent rows of C_q, w.D, and dependent coordinates.
 
-    Sizes: (r, n), (n - r + 1, r), (r), with r rows. w.D contains, transposed, the derivative of the dependent
+    Sizes: (r, n), (n - r + 1, r), (r); r: number of rows. w.D contains, transposed, the derivative of the dependent
     velocities by the independent ones, then the dependent velocities due to C_t. The arrays follow the band of K.
     """
     numbers = matrix_storage(w, n, at.DERIVATIVE_Q)
