@@ -34,8 +34,8 @@ MIN_CLARITY = 10.0
 # a run begins beside its singular start, at a state where C_q has changed by the fraction BESIDE_CHANGE or less. Its
 # first step changes C_q by about the fraction STEP_CHANGE
 BESIDE_CHANGE, STEP_CHANGE = 0.1, 0.6
-# up to N_BESIDE states near the singular start are tried, each half as far away as the last. A state is accepted if its
-# projection onto the constraints moves it by at most MAX_CORRECTION times the state's distance from the start
+# up to N_BESIDE states near the start are tried, each at half the distance of the previous one. A state is accepted if
+# its projection onto the constraints moves it by at most MAX_CORRECTION times the state's distance from the start
 N_BESIDE, MAX_CORRECTION = 6, 0.2
 MAX_RESIDUAL = 1e-6  # largest residual allowed in the equations for the accelerations, relative to the right-hand side
 

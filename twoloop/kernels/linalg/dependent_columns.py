@@ -8,7 +8,7 @@ from twoloop.kernels.data.common import INTEGERS, MATRIX, VECTOR, compiled, i8, 
 
 # kinds of entries of the constraint Jacobian G: NONE is always zero, NUMBER is constant, VARIES depends on positions.
 # In this module, R contains the rows of G during the elimination, and K (same shape) the kinds of the entries of R.
-# columns[i] lists the columns of the entries of row i whose kind is not NONE; row_sizes[i] is their number
+# columns[i] lists the columns in which row i has an entry that is not NONE; row_sizes[i] is the number of these columns
 NONE, NUMBER, VARIES = 0, 1, 2
 ROWS_SEARCHED = 4  # to save time, pivot blocks are sought only in this number of rows, which have the fewest entries
 # limits for a pivot block: three pairs, from strict to loose, are tried until a block meets both limits of a pair
