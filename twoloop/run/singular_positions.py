@@ -196,13 +196,13 @@ def _describe_ratio(ratios: dict[float, float]) -> str:
 ROUNDING = 0.5 * float(np.finfo(np.float64).eps)
 # rounding errors matter only along directions in which the Jacobian's singular value is at most this * the largest one
 WEAK_RATIO = 1e-2
-# whatever rtol is, rounding errors of velocities are estimated if smallest / largest pivot is below SMALL_PIVOT.
+# whatever rtol is, rounding errors of velocities are estimated if min / max pivot of the Jacobian is below SMALL_PIVOT.
 # This ratio of pivots is typically PIVOT_FACTOR times (smallest / largest singular value)
 SMALL_PIVOT, PIVOT_FACTOR = 1e-5, 30.0
 
 
 def singular_threshold(rtol: float) -> float:
-    """Return the ratio, min / max pivot, below which rounding may change v by REPORTED_ERROR * rtol, within limits."""
+    """Return min / max pivot of the Jacobian (at most WEAK_RATIO) where rounding may change v by REPORTED_ERROR * rtol."""
     return min(
         WEAK_RATIO, max(SMALL_PIVOT, PIVOT_FACTOR * float(np.sqrt(ROUNDING / (REPORTED_ERROR * max(rtol, ROUNDING)))))
     )
