@@ -202,7 +202,7 @@ SMALL_PIVOT, PIVOT_FACTOR = 1e-5, 30.0
 
 
 def singular_threshold(rtol: float) -> float:
-    """Return min / max pivot of the Jacobian (at most WEAK_RATIO) where rounding may change v by REPORTED_ERROR * rtol."""
+    """Return min / max pivot of the Jacobian, up to WEAK_RATIO, where rounding changes v by REPORTED_ERROR * rtol."""
     return min(
         WEAK_RATIO, max(SMALL_PIVOT, PIVOT_FACTOR * float(np.sqrt(ROUNDING / (REPORTED_ERROR * max(rtol, ROUNDING)))))
     )
