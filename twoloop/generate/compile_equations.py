@@ -173,9 +173,9 @@ def _stack_array(emit: Emitter, size: int) -> Value:
     return emit.builder.allocate(DOUBLE, size * width_of(emit.double_type))
 
 
-# equations are split into functions if they have more operations than a limit. If null_space.py yields a short program
-# for accelerations, the limit is SPLIT_PROJECTIONS, and only projections are split: this halves the compile time. If
-# not, the limit is SPLIT_ALL, and accelerations are split, too: this makes them 50 % slower
+# equations with more operations than a limit are split into functions. If accelerations have a `reduced_program` (see
+# null_space.py), the limit is SPLIT_PROJECTIONS, and only projections are split, which halves the compile time.
+# Otherwise, the limit is SPLIT_ALL, and accelerations are split, too, which makes them 50 % slower
 SPLIT_PROJECTIONS, SPLIT_ALL = 200, 500
 
 
@@ -228,7 +228,7 @@ class SplitFunctions:
         return list(functions)
 
     def _call(self, emit: Emitter, *calls: tuple[str, Sequence[Value]]) -> Value:
-        """Write `calls` (function, arguments), and functions not written yet; return a flag: 1 if all succeed."""
+        """Write `calls` (function, arguments), and functions still missing; return a flag: 1 if all calls succeed."""
         module, all_valid = emit.builder.module, None
         for part, arguments in calls:
             name = f"{part}_{emit.suffix}"
@@ -241,7 +241,7 @@ class SplitFunctions:
         return all_valid
 
     def _lowering(self, emit: Emitter, graph: Graph, args: Sequence[Value], stored: Mapping[int, Location]) -> Lowering:
-        """Return a Lowering, which writes operations. args[:4]: three inputs of `graph`, pointer to coefficients."""
+        """Return a Lowering, which writes operations. args[:3]: inputs of `graph`; args[3]: pointer to coefficients."""
         *inputs, emit.numbers = args[:4]
         if width_of(emit.double_type) > 1:
             emit.constants = emit.numbers  # type: ignore[attr-defined]  # the coefficients are the same in all lanes
@@ -343,7 +343,7 @@ class SplitFunctions:
         return is_valid
 
     def _stack_arrays(self, emit: Emitter) -> list[Value]:
-        """Return four scratch arrays: for factors of [M G^T; G 0], for r, for c, for multipliers or a change of v."""
+        """Return four scratch arrays: factors of [M G^T; G 0], right sides r and c, multipliers (or a change of v)."""
         sizes = self.solution.n_stored, self.n, self.n_rows, max(self.n, self.n_rows)
         return [_stack_array(emit, size) for size in sizes]
 
@@ -454,7 +454,7 @@ class GeneratedCode(NamedTuple):
         return self.traced.kinds
 
     def is_valid_from(self, system: ConstrainedSystem, t0: float, q0: Array) -> bool:
-        """Return True if a run may start at (t0, q0) with this code, as the same rows and pivots are chosen there."""
+        """Return True if a run may start at (t0, q0) with this code: the code has the rows and pivots chosen there."""
         try:
             return _choice_at(system, t0, q0) == self.shared.equations.choice
         except Untraceable:

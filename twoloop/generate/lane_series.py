@@ -91,11 +91,11 @@ class LaneEmitter(Emitter):
         return power * self.polynomial(EXP2_COEFFICIENTS, x - whole)
 
     def minimum_or_nan(self, a: Value, b: Value) -> Value:
-        """Return the smaller one of a and b, but always a if a or b is NaN: so the result is NaN only if a is NaN."""
+        """Return the smaller one of a and b, or a if one of them is NaN. So the result is NaN only if a is NaN."""
         return self.builder.select(self.builder.compare("fcmp ult", a, b), a, b)
 
     def maximum_or_nan(self, a: Value, b: Value) -> Value:
-        """Return the larger one of a and b, but always a if a or b is NaN: so the result is NaN only if a is NaN."""
+        """Return the larger one of a and b, or a if one of them is NaN. So the result is NaN only if a is NaN."""
         return self.builder.select(self.builder.compare("fcmp ugt", a, b), a, b)
 
 
@@ -149,7 +149,7 @@ def loop_over_coordinates(
 
 
 ZERO_ROW = -1  # index of a row of zeros in memory; rows 0, 1, ... contain the coefficients of order 0, 1, ...
-# largest number of sums in one loop: each sum needs a register; processors have 32 of eight doubles, or 16 of four
+# largest number of sums in one loop: each sum needs a register; processors have 32 registers of 8 doubles, or 16 of 4
 MAX_SUMS_IN_LOOP = 12 if LANES == 8 else 6
 
 
@@ -207,7 +207,7 @@ class LaneSeries:
         return [self.n, self.n_rows, self.early, self.late, self.rows, self.balance, self.factor_indices]
 
     def _expressions(self, sums: Sums, rows: Sequence[int]) -> list[tuple[Terms, float]]:
-        """Return (terms, constant) of each expression in `sums`; in sums.row, expression k has the number rows[k]."""
+        """Return (terms, constant) of each expression in `sums`; rows[k] is the number of expression k in sums.row."""
         more: dict[int, list[tuple[int, float]]] = {row: [] for row in rows}
         for row, i, c in zip(
             sums.row.tolist(), sums.further_column.tolist(), sums.further_coefficient.tolist(), strict=True
@@ -344,7 +344,7 @@ class LaneSeries:
     def _write_order_0(
         self, emit: LaneEmitter, quantities: Quantities, operations: list[Operation], row: "_Row", scratch: Value
     ) -> None:
-        """Write code for order 0 of arguments and results of `operations`; store coefficients of factors in `row`."""
+        """Write code for coefficient 0 of the results of `operations`, and store coefficient 0 of factors in `row`."""
         one, zero = emit.constant(1.0), emit.constant(0.0)
         for operation in operations:
             kind, results, first, second = operation
@@ -421,7 +421,7 @@ class LaneSeries:
     ) -> None:
         """Write code for Taylor coefficient k = `order` > 0 of the results of `operations`; `inverse`: 1 / k.
 
-        Coefficient k of the second factor of a PENDING product is not known yet: the term with it is left out.
+        The second factor of a PENDING product contains v, lam or a; terms with its unknown coefficient k are left out.
         """
         pairs = list(dict.fromkeys(pair for operation in operations for pair in self._factors(operation)))
         sums = {}
@@ -468,7 +468,7 @@ class LaneSeries:
 
 
 class _Row:
-    """Row k of the memory: coefficient k of each factor. `load` reuses values that `store` has written to the row."""
+    """Row k of `scratch`: coefficient k of all factors of products. `load` reuses values that `store` has written."""
 
     def __init__(self, code: LaneSeries, emit: LaneEmitter, base: Value):
         self.code, self.emit, self.base = code, emit, base
@@ -487,9 +487,9 @@ class _Row:
 
 
 class _PartialSums(NamedTuple):
-    """Sums over 1 < j < k of products of coefficients of series X and Y; methods add the terms for j = 1 and j = k."""
+    """Sums over 1 < j < k of X[j] Y[k - j] and X[j] Y[k + 1 - j]; functions sum_of_... add terms for j = 1 and k."""
 
-    sums: dict[tuple[tuple[int, int], bool], Value]  # result of `LaneSeries._write_sums`
+    sums: dict[tuple[tuple[int, int], bool], Value]  # sums over 1 < j < k, from `LaneSeries._write_sums`
     first_row: Value  # pointer to `row_1` if k > 1, else to a row of zeros: products with its entries are then 0
     row_1: Value  # pointer to coefficient 1 of all series
     row_before: _Row  # memory that contains coefficient k - 1 of all series

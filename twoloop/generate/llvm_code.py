@@ -228,7 +228,7 @@ class Quantities:
         """Return `constant` plus the sum of coefficient * quantity over the terms."""
         key = terms, constant
         if self._emit.builder.module.splits_blocks and len(terms) == 1 and constant == 0.0:
-            ((quantity, coefficient),) = terms  # not cached: to multiply again takes no longer than to load the product
+            ((quantity, coefficient),) = terms  # products are not cached: loading one takes as long as multiplying
             return self._emit.scale(coefficient, self.value(quantity))
         if key not in self._sums:
             total: Any = None if constant == 0.0 and terms else self._emit.coefficient(constant)
@@ -366,7 +366,7 @@ class Lowering(Algebra[Value]):
         return self._sines_and_cosines[first.key][kind == COSINE]
 
     def run(self, graph: Graph, quantities: Iterable[int], locations: Mapping[int, Location] = NO_LOCATIONS) -> None:
-        """Write code that computes `quantities` in the given order, and stores those that are keys of `locations`."""
+        """Write code that computes `quantities` in this order, and stores quantity i at locations[i] if i is a key."""
         if not locations:
             return super().run(graph, quantities)
         for i in quantities:

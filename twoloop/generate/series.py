@@ -39,8 +39,8 @@ class Sums(NamedTuple):
     coefficient: Array  # for each expression, the coefficient of its first term
     constant: Array  # for each expression, its constant
     row: Integers  # for each term after an expression's first term, the index of the expression; see `_nonzero_sums`
-    further_column: Integers  # for each term after an expression's first term, the index of its quantity
-    further_coefficient: Array  # for each term after an expression's first term, its coefficient
+    further_column: Integers  # for each term after an expression's first term, the index of the quantity in this term
+    further_coefficient: Array  # coefficients of all terms after an expression's first term
 
 
 @dataclass(frozen=True)
@@ -296,7 +296,7 @@ def _needed_operations(graph: Graph, exprs: list[Affine]) -> list[tuple[int, Any
 
 
 def _nonzero_sums(exprs: list[Affine], places: dict[int, int]) -> tuple[Sums, Integers]:
-    """Return the nonzero expressions as Sums, and their indices in `exprs`; the field `row` has these indices, too."""
+    """Return the nonzero expressions as Sums, and their indices in `exprs`; Sums.row has indices in `exprs`, too."""
     indices = [k for k, expr in enumerate(exprs) if expr.terms or expr.constant]
     sums = _convert_to_sums([exprs[k] for k in indices], places)
     index_array = np.array(indices, dtype=np.int64)

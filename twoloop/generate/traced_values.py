@@ -33,9 +33,9 @@ N_NEARBY = 8  # before a run, calls and traces are compared at the start, and at
 RELATIVE_TIMES = np.linspace(0.0, 1.0, N_NEARBY)  # times of the random states, from 0 (start of the run) to 1 (its end)
 NEARBY_DISTANCE = 0.3  # largest distance of a random position from the start, relative to the sizes of the coordinates
 MAX_STATES_OF_CHUNK = 32  # a `Sample` takes at most about this number of states from one chunk of steps
-MAX_STATES = 64  # largest number (about) of states in a comparison; largest number of chunks with states in a `Sample`
+MAX_STATES = 64  # about the largest number of states in a comparison, and largest number of chunks in a `Sample`
 MAX_STATES_IN_PYTHON = 9  # replaces MAX_STATES if the callbacks are called in Python
-MAX_ENTRIES = 20_000  # fewer states are compared in large systems: (states) * (results per state) is about this at most
+MAX_ENTRIES = 20_000  # so few states are compared that (states) * (results per state) does not much exceed this
 # the scale of a callback's rounding errors: the largest bound on errors of its results, divided by EPS (see checks.py)
 ROUNDING_DIFFERENCE = 16.0 * np.finfo(float).eps  # differences up to this * (scale of rounding errors) are harmless
 CLEAR_DIFFERENCE = 1e-6  # a trace is wrong if a difference exceeds this * (scale of rounding errors), or is systematic
@@ -124,7 +124,7 @@ class CallbackTraces:
         else:
             is_agreeing |= ~finite
         largest = np.where(np.isfinite(bounds), bounds, 0.0).max(axis=0)
-        # scale for each entry: the largest bound on the rounding errors of all entries of the same callback
+        # scale for an entry: among all entries of the entry's callback, the largest bound on rounding errors
         scales = np.repeat(np.maximum.reduceat(largest, np.cumsum(self.n_entries) - self.n_entries), self.n_entries)
         for k, entry in np.argwhere(~is_agreeing & ~(differences <= ROUNDING_DIFFERENCE * scales)):
             if not differences[k, entry] <= CLEAR_DIFFERENCE * scales[entry] or self._is_systematic(

@@ -63,7 +63,7 @@ class StallDetector:
         self.window_n += len(h)
 
     def is_stalled(self, t: float, t1: float) -> bool:
-        """Return whether a run to t1 is stalled at time t; False until STAGNATION_STEPS steps follow the last check."""
+        """Return whether a run to t1 is stalled at time t; False within STAGNATION_STEPS steps of the last check."""
         if self.window_n < STAGNATION_STEPS:
             return False
         self.mean_step = (t - self.window_t) / self.window_n
@@ -77,7 +77,7 @@ class StallDetector:
 
 
 MAX_SAMPLES = 8  # largest number of sampled states, spread about evenly over the run
-N_LAST_STEPS = 8  # number of steps before a sampled state; their median is the step size of the sample
+N_LAST_STEPS = 8  # number of steps before a sampled state; the median of their sizes is the step size of the sample
 N_ITERATIONS = 6  # number of power iterations at each sampled state
 # a power iteration starts with the eigenvector at the previous sample, to which INITIAL_FACTOR times a vector without
 # zeros (`initial_direction`) is added, because a component that is zero at the start might stay zero
@@ -85,8 +85,8 @@ INITIAL_FACTOR = 0.1
 # in a power iteration x -> J x, the dominant eigenvalue of J is negative if cos(x, J x) is below minus this number
 MIN_ALIGNMENT = 0.9
 MIN_STEPS = 200  # after fewer accepted steps, a message does not mention stiffness
-# a method is stable if (step size) * (rate of the fastest vibration or decay) is at most a limit. Steps count as
-# limited by stability if the median of this product / limit in all samples is at least this; other runs have about 0.4
+# a method is stable if (step size) * (rate of the fastest vibration or decay) is at most a limit. Stability limits
+# the steps if the median over all samples of (product / limit) is at least this; in other runs, the median is about 0.4
 MIN_STABILITY_RATIO = 0.45
 
 
@@ -172,7 +172,7 @@ def _fastest_rates(kit: Any, work: Any, sample: StiffnessSample, directions: lis
 def _dominant_eigenvalue(
     kit: Any, work: Any, sample: StiffnessSample, direction: Array, independent: NDArray[np.int64], by_v: bool
 ) -> tuple[float, bool]:
-    """Return |x| and whether x < 0, for the dominant eigenvalue x of dF/dq, or dF/dv if `by_v` (F: accelerations).
+    """Return |x| and whether x < 0; x: dominant eigenvalue of dF/dq, or of dF/dv if `by_v` (F: accelerations).
 
     Only the coordinates `independent` (indices) vary. `direction`: first vector of the iteration, then the eigenvector.
     """

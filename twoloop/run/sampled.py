@@ -121,7 +121,7 @@ class SampledRun:
                 f"have lost rank there ({dependent_rows(self._derived_system, t, q)}), but not beside it. Start a "
                 "little before that position, or beyond; run and solve_dae may start there"
             )
-        run.work.notes[indices.GENERATION] = 1.0  # number of partitions; above 0, kernels use the run's ranks
+        run.work.notes[indices.GENERATION] = 1.0  # as if a partition existed: kernels then keep the ranks of C_q and G
         run.set_step_sizes(None, self.max_step, t + 1.0)
         run.control[run.a.STORE_ALL] = 0.0
         return run
@@ -173,7 +173,7 @@ class SampledRun:
             self._integrate_to(end)
             if not may_have_missed_changes(self.run):
                 return
-            if len(self.times) > 1:  # earlier calls, which are not repeated, may have missed short changes, too
+            if len(self.times) > 1:  # earlier calls of `step` may also have missed short changes, but are not repeated
                 warn_of_missed_changes(self.run)
             self._max_gap = gap_for_repetition(self.run)
             self._return_to_sample()
@@ -231,7 +231,7 @@ class SampledRun:
         run, a = self.run, self.run.a
         code = entry_point(run.kernels.start)(run.kit, run.work, t, run.state)
         n_not_reset = 0
-        if run.plan.first is not None:  # keep the numbers that decide when a pair of methods switches
+        if run.plan.first is not None:  # for a pair of methods, keep the estimates that decide when to switch
             from twoloop.kernels.control.stiffness import N_SCALARS
 
             n_not_reset = N_SCALARS + 2 * run.system.n_q

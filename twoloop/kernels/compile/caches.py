@@ -328,7 +328,7 @@ class _CodeCache(FunctionCache):
 
     def __init__(self, function: Callable[..., Any], stamp: str, key: str, announcement: str):
         cache_dir: str = numba.config.CACHE_DIR  # type: ignore[attr-defined]
-        if cache_dir:  # create the folder before numba does, which might let other users write to it
+        if cache_dir:  # create the folder first: numba might create a folder that other users can write
             with suppress(OSError):
                 make_trusted_folder(Path(cache_dir, _LOCATOR.get_suitable_cache_subpath(inspect.getfile(function))))
         super().__init__(function)

@@ -63,8 +63,8 @@ class Work(NamedTuple):
     G_of_S: Any  # (n_c + n_a, n_q) if M is constant: the G for which S and W were computed; NaN: S and W are invalid
     pattern: Any  # (n_c + n_a, n_q) 1 for entries of the constraint Jacobian that have been nonzero in the run, else 0
     mass_pattern: Any  # (n_q, n_q) 1 for entries of M that have been nonzero, else 0; only in the form AUGMENTED
-    row_entries: Any  # for each row of G, where its list of nonzero columns begins in this array; then these lists
-    Gamma_tried: Any  # (2, n_c + n_a) Gamma by differences: row 0 with doubled time step, row 1 with the last one tried
+    row_entries: Any  # row_entries[row_entries[i] : row_entries[i + 1]]: columns of row i of G where `pattern` is 1
+    Gamma_tried: Any  # (2, n_c + n_a) Gamma by differences: with doubled time step, and with the time step tried before
     rates: Any  # (13, n_c + n_a) constraint rates C_t and b at 13 times within a step, see discontinuities.py
     changes: Any  # (N_CHANGES, n_q + n_c + n_a) samples of forces and constraint rates, see discontinuities.py
     Q: Any  # (n_q) generalized forces
@@ -196,7 +196,7 @@ OWN_FUNCTIONS = {
     # functions of collocation steps; `memory` is described in data/collocation.py, `numbers` is f.own_numbers
     "attempt_nodes": f8(*[VECTOR] * 4),  # (memory, state, tolerances, numbers): solve for stages; return a code
     "audit_nodes": f8(*[VECTOR] * 3),  # (memory, state, numbers): return the largest defect between nodes; -1: failure
-    "retry_nodes": types.none(*[VECTOR] * 2),  # (memory, state): predict a shorter step from a rejected one
+    "retry_nodes": types.none(*[VECTOR] * 2),  # (memory, state): store a rejected step's polynomial for the next one
     "end_nodes": types.none(*[VECTOR] * 3),  # (memory, state, new_state): compute the state at the end of the step
     "correct_ends": types.none(*[VECTOR] * 2),  # (memory, numbers): move the ends of 8 steps at once towards C = 0
     "project_ends": types.none(*[VECTOR] * 2),  # (memory, numbers): project the ends of 8 steps at once; find a, lam
@@ -307,7 +307,7 @@ class Kit:
     `functions`: callbacks and data of the system. `own`: functions generated for the mechanism, if any. `inner`: the
     inner loop, which may call `own`. `general`: the inner loop for any mechanism, for what generated code cannot do.
     `step`: functions of the method, or None if no kernel calls them. `first`, `second`: functions of two methods
-    between which the run may switch. `numbers`: data of generated functions of a state; `own_numbers`: of collocation.
+    between which the run may switch. `numbers`: data of generated functions of a state; `own_numbers`: of steps.
     """
 
     def __init__(
@@ -410,7 +410,7 @@ TINY = 1e-300  # smallest result of `smallest_size`, which avoids divisions by z
 
 @merged
 def smallest_size(tolerances):
-    """Return the size as which smaller coordinates and velocities count: the smallest atol / rtol, at most 1."""
+    """Return the lower limit of typical sizes of q and v: the smallest atol / rtol of all coordinates, at most 1."""
     size = 1.0
     if tolerances[RTOL] > 0.0:
         for k in range(ATOL, tolerances.size):
@@ -420,7 +420,7 @@ def smallest_size(tolerances):
 
 @merged
 def typical_size(tolerances, x):
-    """Return the typical size of x (q or v): max|x_k|, at least `smallest_size`, at most 1; or 1 if x and atol are 0.
+    """Return the typical size of x (q or v): max|x_k|, clipped to [`smallest_size`, 1]; 1 if x and an atol are 0.
 
     Smaller components count as this size. If it were 1 for a mechanism of 1e-9 m, finite differences would displace q
     by 1e-7 m, and a correction of 1e-14 m would count as rounding. As x may be rounding errors, such as velocities at
@@ -451,7 +451,7 @@ def is_beyond_gap(tolerances, h):
 
 @merged
 def gap_ratio(tolerances, h):
-    """Return h / tolerances[GAP] if a step of size h must be rejected because it `is_beyond_gap`, else 0."""
+    """Return h / (longest allowed time between evaluations) if a step of size h is rejected as too long, else 0."""
     if tolerances[ESTIMATE] == 1.0 and is_beyond_gap(tolerances, h):
         return h / tolerances[GAP]
     return 0.0

@@ -35,9 +35,9 @@ POSITION_WEIGHTS = WEIGHTS * (1.0 - NODES)  # weights with which c(s) at NODES y
 
 
 def _error_constants():
-    """Return |g_k - g_{k+1}| at equal steps for each order k from 0 to HIGHEST (g: coefficients for velocities).
+    """Return the error constants |g_k - g_{k+1}| of equal steps for orders k = 0 ... HIGHEST (g: see module docstring).
 
-    The estimate of the velocity error is h |g_k - g_{k+1}| d, where d is evaluated minus predicted accelerations.
+    The estimated velocity error is h |g_k - g_{k+1}| d, where d are the evaluated minus the predicted accelerations.
     """
     coefficients = np.ones(HIGHEST + 1)
     for k in range(1, HIGHEST + 1):
@@ -45,8 +45,8 @@ def _error_constants():
     return np.abs(coefficients)
 
 
-# error constants |g_k - g_{k+1}| of equal steps, which are also lower limits for unequal steps: after a decrease of h,
-# constants of unequal steps are so small that the error estimate would miss errors where forces jump
+# error constants of equal steps. A step's error estimate uses the larger one of this constant and that for the actual
+# step sizes: after a decrease of the step size, the latter is so small that errors where forces jump would be missed
 ERROR_CONSTANTS = _error_constants()
 
 THETA, N_OPTIONS = range(2)  # THETA: index in `options` of the tolerance of projections, see `project`
@@ -63,8 +63,8 @@ THETA, N_OPTIONS = range(2)  # THETA: index in `options` of the tolerance of pro
     N_SCALARS,
 ) = range(8)
 # indices of rows in `memory`. PSI: times (s) from earlier states to the last state. NEW_PSI: times from these states to
-# the end of the step. BETA: factors that adapt differences to the step size. G_VELOCITY, G_POSITION: coefficients of
-# differences in v, in q. C_AT_NODES: scratch for c_i(s) at NODES
+# the end of the step. BETA: factors that adapt differences to the step size. G_VELOCITY, G_POSITION: coefficients g_i
+# (for v) and G_i (for q) of the differences. C_AT_NODES: scratch for c_i(s) at NODES
 PSI, NEW_PSI, BETA, G_VELOCITY, G_POSITION, C_AT_NODES, N_ROWS = range(7)
 
 

@@ -82,7 +82,7 @@ def _vector_view(memory, n, index):
 
 @compiled
 def _add_weighted_slopes(y, h, weights, slopes, total, y1):
-    """Set y1 to y + h * (sum of weights[k] * slopes[k]); first, the sum is stored in `total`, to reduce rounding."""
+    """Store the sum of weights[k] * slopes[k] in `total`, then y + h * total in y1; adding y last reduces rounding."""
     sum_rows(weights, slopes, total)
     for m in range(y.size):
         y1[m] = y[m] + h * total[m]
