@@ -196,7 +196,7 @@ OWN_FUNCTIONS = {
     # functions of collocation steps; `memory` is described in data/collocation.py, `numbers` is f.own_numbers
     "attempt_nodes": f8(*[VECTOR] * 4),  # (memory, state, tolerances, numbers): solve for stages; return a code
     "audit_nodes": f8(*[VECTOR] * 3),  # (memory, state, numbers): return the largest defect between nodes; -1: failure
-    "retry_nodes": types.none(*[VECTOR] * 2),  # (memory, state): store a rejected step's polynomial for the next one
+    "retry_nodes": types.none(*[VECTOR] * 2),  # (memory, state): store a rejected step's polynomial for a shorter step
     "end_nodes": types.none(*[VECTOR] * 3),  # (memory, state, new_state): compute the state at the end of the step
     "correct_ends": types.none(*[VECTOR] * 2),  # (memory, numbers): move the ends of 8 steps at once towards C = 0
     "project_ends": types.none(*[VECTOR] * 2),  # (memory, numbers): project the ends of 8 steps at once; find a, lam
