@@ -231,7 +231,7 @@ class SampledRun:
         run, a = self.run, self.run.a
         code = entry_point(run.kernels.start)(run.kit, run.work, t, run.state)
         n_not_reset = 0
-        if run.plan.first is not None:  # for a pair of methods, keep the estimates and counts that decide when to switch
+        if run.plan.first is not None:  # a pair of methods keeps the estimates and counts that decide when it switches
             from twoloop.kernels.control.stiffness import N_SCALARS
 
             n_not_reset = N_SCALARS + 2 * run.system.n_q
