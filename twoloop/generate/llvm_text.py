@@ -144,7 +144,7 @@ class Module:
 
     def __init__(self, splits_blocks: bool = False) -> None:
         self.splits_blocks = splits_blocks
-        self.block_addresses: list[str] = []  # LLVM does not merge the parts of split blocks whose addresses are here
+        self.block_addresses: list[str] = []  # LLVM does not merge a block in this list with the block before it
         self._tables: list[str] = []
         self._numbers: list[float] = []  # numbers that `Builder.load_constant` loads
         self._declared: dict[str, str] = {}

@@ -77,7 +77,7 @@ def start(f, w, t, state):
         code = find_tangents(f, w, t, q)
     if code == DONE:
         code = accelerations(f, w, t, q, v, state[2 * n : 3 * n], state[3 * n :])
-    # the allowed error of Gamma by finite differences depends on the size of Gamma, now known: compute Gamma again
+    # the size of Gamma, which sets the allowed error of finite differences for Gamma, is now known: compute Gamma again
     if code == DONE and f.gamma_given == 0:
         code = accelerations(f, w, t, q, v, state[2 * n : 3 * n], state[3 * n :])
     return code
@@ -99,9 +99,9 @@ def _locate_rate_jump(f, w, t, size, tolerances, accepted, state, new_state):
 
 @merged
 def _attempt_step(f, w, options, memory, tolerances, control, clock, t, size, crosses_jump, state, new_state):
-    """Attempt a step; return a code (DONE: no failure), the error in tolerances, and next size / `size` (0: unknown).
+    """Attempt a step; return a code, its error in tolerances, and (next step size) / size, which is 0 if unknown.
 
-    If `crosses_jump`, no step is computed: `new_state` already contains the state after a jump of C_t or b.
+    If `crosses_jump`, compute nothing: `new_state` already is the state after a jump of C_t or b. DONE: no failure.
     """
     w.orientation_new = 0.0
     if clock[at.FAILURE_CODE] == DONE:
@@ -124,7 +124,7 @@ def _attempt_step(f, w, options, memory, tolerances, control, clock, t, size, cr
 
 @merged
 def _must_repeat_at_jump(f, w, tolerances, control, clock, t, size, accepted, state, new_state):
-    """Return True if C_t or b has a jump or steep ramp within a step, so that the step is repeated, and ends there.
+    """Return True if a step must be repeated with another end, because C_t or b jumps or has a steep ramp in the step.
 
     For a jump, store the times just before and after it in clock[JUMP_FROM] and clock[JUMP_TO]. A ramp matters
     only if the step was `accepted` and its size is not fixed. For a ramp, store the next step size in clock[H_NEXT].

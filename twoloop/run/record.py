@@ -556,7 +556,7 @@ def state_fields(n: int, t: Array, table: Array) -> dict[str, Array]:
 
 
 def interval_kinds(run: "Run", steps: Array) -> Integers:
-    """Return a code for each step, the kind of its interval for dense output; no step is a crossing or a jump."""
+    """Return the kind of interval (a code) of each step, for dense output; no step may be a crossing or a jump."""
     if run.plan.separate:
         return np.full(len(steps), indices.SEPARATE)
     explicit_kind = indices.ACROSS if run.substituted else indices.ACCELERATIONS

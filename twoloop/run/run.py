@@ -121,13 +121,13 @@ class Run:
         self.sizes_to_try: list[float] = []  # step sizes (s) still to be tried across a singular position
         self.attempts_left = np.inf  # the search for a step across a singular position ends after so many failures
         self.crossing_size = 0.0  # size (s) of the last attempted step across a singular position
-        self.piece_ends: list[float] = []  # end times (s) of next steps along a polynomial across a singular position
-        self.origins: list[Any] = []  # for each polynomial to be tried for a crossing, its `Origin` (begin, limits)
+        self.piece_ends: list[float] = []  # remaining end times (s) of steps that divide a crossing's polynomial
+        self.origins: list[Any] = []  # the `Origin` of each polynomial that is still to be tried for a crossing
         self.t1 = np.inf  # end of the run (s)
         self.starts_singular = False  # whether the start is a singular position: nearby, C_q has a higher rank
         self.branch_known = False  # whether it is known on which branch the motion leaves a singular start
         self.jumps: list[float] = []  # times (s) at which velocities jumped because C_t, or b in A v + b = 0, jumped
-        self.compared_until = [-np.inf]  # latest time (s) of a comparison with traces; copies of the run share the list
+        self.compared_until = [-np.inf]  # callbacks agreed with traces up to this time (s); run copies share the list
         self.region: CheckedRegion | None = None  # where callbacks agreed with traces; None: the system's region
         self.varied_parameters: Array | None = None  # current parameters in a ParametricRun; None in other runs
         self._compute_start_accelerations()

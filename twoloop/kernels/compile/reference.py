@@ -39,7 +39,7 @@ class Reference(types.Type):
 
     name : unique name of the type.
     arrays : type of each array, by name of its field; all arrays are contiguous, with one or two dimensions.
-    elements : keys: fields of arrays. Values: {name: index}; in compiled code, `structure.name` is this array element.
+    elements : {field of an array: {name: index of an element}}; in compiled code, `structure.name` is this element.
     """
 
     def __init__(
@@ -212,7 +212,7 @@ def _load_array(context: Any, builder: Any, typ: Any, pointer: Any, field: str) 
     }
     model = context.data_model_manager[kind]
     array = ir.Constant(context.get_value_type(kind), ir.Undefined)
-    for name, value in fields.items():  # LLVM keeps an array whose fields are inserted in registers
+    for name, value in fields.items():  # LLVM keeps an array in registers if insert_value sets each of its fields
         index = model.get_field_position(name)
         element = ir.Constant(array.type.elements[index], None) if value is None else value
         array = builder.insert_value(array, element, index)

@@ -58,7 +58,7 @@ H_BEFORE, ERROR_BEFORE, N_PAST = range(3)
     TIME_SPACING,  # longest time (s) between samples of the forces at a fixed state, see discontinuities.py
     SAMPLE_MOTION,  # 1: forces may be sampled along predicted motion; 0: no more, since a callback raised an exception
     BY_TIME,  # 1: a force or a constraint rate (C_t, b) may change suddenly with time; 0: none does
-    BY_STATE,  # 1: a force may change suddenly with q or v: steps above SPACING sample the motion; 0: no sudden change
+    BY_STATE,  # 1: a force may change suddenly with q or v, and is sampled in steps longer than SPACING; 0: none does
     FIRST_GIVEN,  # 1: the user has chosen the first step size; 0: it is a guess, and may grow before a step is accepted
     MAX_EVALUATION_GAP,  # longest time in a step between two evaluations of the equations, relative to the step size
     TAKES_MANY,  # 1: the method has `attempt_many`, which takes steps without checks between them; 0: it does not
@@ -88,7 +88,7 @@ H, ERRORS, FAILURES, PARTITIONS, JACOBIANS, N_STEP_COLUMNS = range(6)
     JUMP_TO,  # end (s) of the short time span with the next known jump of a constraint rate (C_t, b)
     APPLIES_JUMP,  # 1: the next step ends at JUMP_TO, in the state that `new_state` already contains; 0: ordinary step
     JUMP_END,  # end (s) of the last step rejected with a very large error: a force may jump before this time
-    # fixed-order form: smallest pivot after the last accepted step, or after one rejected later by `ends_near_singular`
+    # smallest pivot at the end of the last step accepted, or rejected by `ends_near_singular` (fixed-order form)
     PIVOT_HERE,
     # forces, C_t and b are sampled ahead of a step, at a fixed state (where the step starts) or along predicted motion
     SAMPLED_TO,  # time (s) of the last sample at a fixed state

@@ -105,7 +105,7 @@ def size_on_grid(clock, t, h, target, goal):
 
 @merged
 def size_off_grid(control, t, h, time_to_goal, crosses_jump):
-    """Return a step size (s) of at most about h, and whether the step must take `time_to_goal` (s) instead."""
+    """Return a step size (s), about h or less, and True if the step must have the size `time_to_goal` (s) instead."""
     reaches_goal = crosses_jump or h >= time_to_goal * (1.0 - 1e-10)
     size = h
     if h > 0.5 * time_to_goal and not reaches_goal:
@@ -130,7 +130,7 @@ def count_step(w, tolerances, control, clock, size, out_step):
     gap = size
     if w.defect >= 0.0:
         gap = min(size, tolerances[DEFECT_GAP])
-    elif is_beyond_gap(tolerances, size):  # only steps with evaluations within them may be so long
+    elif is_beyond_gap(tolerances, size):  # a step longer than tolerances[GAP] also evaluates forces within the step
         gap = control[at.MAX_EVALUATION_GAP] * size
     w.widest_gap = max(w.widest_gap, gap)
     clock[at.H_LONG] = max(size, H_LONG_DECAY * clock[at.H_LONG])
@@ -160,8 +160,8 @@ def store_prediction(w, q1):
 def prediction_error(w, tolerances, h, q, v, q1):
     """Return the largest |w.predicted - q1| (dependent positions) / (allowed error), for a step from (q, v) to q1.
 
-    The formula predicted w.predicted; q1 satisfies the constraints. The allowed error is the tolerance or, if smaller,
-    about FRACTION_OF_MOTION (if det C_qd changes sign: FRACTION_AT_SIGN_CHANGE) times the largest displacement.
+    The formula predicted w.predicted; q1 satisfies C = 0. The allowed error is the tolerance, but at most about
+    a fraction of the largest displacement: FRACTION_OF_MOTION, or FRACTION_AT_SIGN_CHANGE if det C_qd changes sign.
     w.orientation_new becomes the sign of det C_qd, from its factors in `w`. If steps have a fixed size, only return 0.
     """
     if tolerances[ESTIMATE] == 0.0:

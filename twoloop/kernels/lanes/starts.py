@@ -53,9 +53,9 @@ def subtract_products(work, target, x, x_stride, y, y_stride, count):
 
 @merged
 def subtract_row_product(work, target, entries, pattern, i, y):
-    """In each lane, subtract the dot product of row i of a sparse matrix and the vector at offset y from `target`.
+    """In each lane, subtract from the number `target` the product of row i of a sparse matrix and a vector y.
 
-    `entries`: offset of the nonzero entries, row by row; pattern[pattern[i]:pattern[i + 1]] are the columns of row i.
+    Offsets: `target`, `y`, `entries` (nonzero, row by row). Row i has the columns pattern[pattern[i]:pattern[i + 1]].
     """
     for e in range(pattern[i], pattern[i + 1]):
         subtract_products(work, target, entries + e - pattern[0], 1, y + pattern[e], 1, 1)
@@ -332,7 +332,7 @@ def _project_velocities(code, settings, control, pattern, moves, work):
     fill_field(work, at.ACTIVE, 1.0)
     code.compute_rows(0, control, work)
     factor_gram(work, pattern, moves, n_rows, n_redundant, G, row, factors)
-    for _ in range(2):  # the second pass removes the rounding errors of a large change
+    for _ in range(2):  # the second correction of v removes rounding errors that a large first correction left
         for i in range(n_rows):
             fill_field(work, x + i, 0.0)
             subtract_row_product(work, x + i, G, pattern, i, new + n)
@@ -456,8 +456,8 @@ def _relative_residual(value, allowed):
 def motion_residuals(f, sizes, t, rtol, atol, runs, parameters, states_q, states_v, ends, scratch, worst):
     """Store in worst[k] the largest residual of the equations, relative to its limit, at the end of run runs[k].
 
-    The equations are C = 0, C_q v + C_t = 0, C_q a = gamma and M a + C_q^T lam = Q. The limit is `rtol` times the
-    terms of the equation, and for constraints also the effect of errors `atol` of coordinates and velocities.
+    The equations are C = 0, C_q v + C_t = 0, C_q a = gamma (if given) and M a + C_q^T lam = Q. The limit is `rtol`
+    times the magnitude of an equation's terms; for constraints, the effect of errors `atol` of q, v or a is added.
     sizes : n, n_c and the index in f.p of the first parameter; runs : (m,) indices of runs, or -1 to skip an entry;
     parameters : (n_runs, n_p); states_q, states_v : (m, n, n_t), with the end as the last time; ends : (m, n + n_c)
     a and lam at the end; scratch : (n (n + 3) + n_c (n + 3),) overwritten; worst : (m,).

@@ -64,12 +64,12 @@ def index_size(r: int) -> int:
 
 
 def values_size(r: int, may_be_dense: bool = True) -> int:
-    """Return the length of `values`, the array for the factors of r rows: sparse or, if `may_be_dense`, also dense."""
+    """Return the length of `values` for r rows: enough for sparse factors, and for dense ones if `may_be_dense`."""
     return r * (r if may_be_dense else min(r, MAX_ENTRIES_PER_LINE)) + r
 
 
 def max_subtractions(r: int) -> int:
-    """Return the largest number of subtractions of a program for r rows; if there are more, factors are dense."""
+    """Return how many subtractions a program for r rows may have; if more are needed, factors are dense."""
     return min(r * r * (r + 1) // 2, MIN_SUBTRACTIONS + SUBTRACTIONS_PER_ROW * r)
 
 

@@ -16,7 +16,7 @@ newton_step.py, which solves all stages together, uses one set of derivatives fo
 multiplies derivatives by the inverse of T^T M T. For a matrix that is used in one iteration, this is twice the work.
 
 Under step-size control, a step of TR-BDF2 (order 2) ends close to the result of its embedded formula of order 3: the
-difference of both results is multiplied by filters (I - z J)^-1 with the Jacobian J, and then subtracted from that of
+difference of the results is multiplied by filters (I - z J)^-1 with the Jacobian J, and subtracted from the result of
 order 2. The filter keeps the method L-stable. The tolerance limits the difference, but the error of a step is smaller:
 errors of many short steps add up to about the tolerance, not to a multiple of it. `f`: kit, `w`: workspace.
 """
@@ -222,7 +222,7 @@ def stages_at_once(options):
 
 @compiled
 def _update_derivatives(f, w, options, tolerances, memory, t, h, Q, V, F):
-    """Renew derivatives at (t, Q, V; accelerations F) and factors for Newton's method if outdated; return a code."""
+    """If Newton's Jacobian or its factors are outdated, renew them at (t, Q, V; accelerations F); return a code."""
     if f.force_by_q_given == 1 or memory[at.HAS_JACOBIAN] == 0.0:
         multipliers(f, w, t, Q, V, F, w.lam)
         memory[at.HAS_JACOBIAN] = 1.0
@@ -353,7 +353,7 @@ def _store_weighted_sums(w, h, V_stage, A_stage, weights, factor, e_q, e_v):
 
 @compiled
 def _renew_derivatives(f, w, options, tolerances, memory, t, h, new_state):
-    """Compute derivatives at the end (t, `new_state`) of a step of size h; factor Newton's matrices; return a code."""
+    """Renew Newton's Jacobian, and its factors for step size h, at a step's end (t, `new_state`); return a code."""
     n = w.Q.size
     Q, V, F = vector(memory, 1, n, at.Q_MID), vector(memory, 1, n, at.V_MID), vector(memory, 1, n, at.A_MID)
     copy(new_state[:n], Q)
