@@ -101,7 +101,7 @@ def _locate_rate_jump(f, w, t, size, tolerances, accepted, state, new_state):
 def _attempt_step(f, w, options, memory, tolerances, control, clock, t, size, crosses_jump, state, new_state):
     """Attempt a step; return a code, its error in tolerances, and (next step size) / size, which is 0 if unknown.
 
-    If `crosses_jump`, compute nothing: `new_state` already is the state after a jump of C_t or b. DONE: no failure.
+    If `crosses_jump`, compute nothing: `new_state` is the state after a jump of C_t or b. Code DONE: no failure.
     """
     w.orientation_new = 0.0
     if clock[at.FAILURE_CODE] == DONE:
@@ -329,7 +329,7 @@ def advance(
         error *= error_factor
         if factor == 0.0:
             factor = step_size_ratio(control, clock, size, error)
-        elif error_factor > 1.0 and error > 0.0:  # the step-size factor of the method ignores `error_factor`
+        elif error_factor > 1.0 and error > 0.0:  # the method, which proposed `factor`, does not know `error_factor`
             factor = min(factor, max(control[FACTOR_MIN], control[SAFETY] * error ** -control[EXPONENT]))
         proposed_size = min(size * factor, clock[at.H_LIMIT])
         if not accepted and factor > 1.0:

@@ -195,7 +195,7 @@ class Recorder:
             self._rows[-1, : len(row)] = row
 
     def store_crossing(self, memory: Array) -> None:
-        """If `memory` has a polynomial of the crossing step from the last state, copy `memory` for dense output."""
+        """If `memory` has the polynomial of a crossing that began at the last state, copy `memory` for dense output."""
         from twoloop.kernels.steps.crossing_step import END, N_STORED
 
         if self.interpolator is not None and memory[-N_STORED:][END] > -np.inf:
@@ -534,7 +534,7 @@ INITIAL_COUNTS = np.array([0, 0, 1])
 
 
 def step_fields(steps: Array, counts: Integers) -> dict[str, NDArray[Any]]:
-    """Return the fields of a record that have one row per step, such as the step size h; `steps`: rows from kernels.
+    """Return the fields of a record with one row per step, such as h; `steps`: rows of `out_steps` (loop_state.py).
 
     `counts`: the three counts of INITIAL_COUNTS before these steps; on return, after these steps.
     """

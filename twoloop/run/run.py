@@ -336,7 +336,7 @@ class Run:
         )
 
     def find_redundant_rows(self) -> tuple[NDArray[np.int64], str]:
-        """Return indices of redundant rows at the start and a warning; raise ValueError for contradictory rows."""
+        """Return indices of redundant rows at the start, and a warning or ""; raise ValueError if rows contradict."""
         n_rows = self.system.n_c + self.system.n_a
         if self.rank == n_rows:
             return np.zeros(0, dtype=np.int64), ""
@@ -369,7 +369,7 @@ class Run:
         return describe_singular_start(self.system, self.t0, q, self.rank, self.rtol, atol)
 
     def violated_rows(self, rows: Rows) -> NDArray[np.int64]:
-        """Return the indices of the constraint rows that the accelerations at the start violate; `rows`: G."""
+        """Return the indices of the rows of G a = Gamma that the accelerations at the start violate; `rows`: G."""
         n = self.system.n_q
         a, gamma = self.state[2 * n : 3 * n], self.work.Gamma
         residual = np.abs(rows @ a - gamma)
@@ -415,7 +415,7 @@ class Run:
         return size
 
     def defect(self) -> float | None:
-        """Return the largest defect of the steps, or None if the defect was not evaluated in all steps."""
+        """Return the largest defect of the steps, or None if there is a step whose defect was not evaluated."""
         notes = self.work.notes
         is_checked = self.work.counters[indices.N_ACCEPTED] > 0 and notes[indices.UNCHECKED] == 0.0
         return float(notes[indices.LARGEST_DEFECT]) if is_checked else None
