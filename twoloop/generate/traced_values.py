@@ -215,7 +215,7 @@ Check = Callable[[CallbackTraces], None]  # function that compares traces with c
 
 
 def accept_traces(traced: CallbackTraces) -> None:
-    """Accept traces without a comparison: a `Check` for traces that compute no motion, or that are compared later."""
+    """Do not compare traces with calls: a `Check` for traces that compute no motion, or that are compared later."""
 
 
 def states_near_start(t0: float, t1: float, q: Array, v: Array) -> Array:

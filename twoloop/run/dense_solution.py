@@ -341,9 +341,10 @@ class Interpolator:
     def _divide_intervals(
         self, table: StateTable, plan: Plan, kit: Any, numbers: Integers
     ) -> dict[float, tuple[Array, Array]]:
-        """Divide each of the intervals `numbers` (indices) into `plan.parts` steps, or fewer if steps fail.
+        """Divide each interval in `numbers` (indices) into `plan.parts` steps; if one of them fails, into fewer.
 
-        Return a dict: the key is the time at which an interval begins, the value is its (times, states).
+        Return a dict: the key is the time at which an interval begins, the value is its (times, states). Intervals that
+        cannot even be divided into two steps are left out.
         """
         n = self.system.n_q
         state = np.zeros(3 * n + self.system.n_c + self.system.n_a)

@@ -407,7 +407,7 @@ def digests_of(function: Callable[..., Any]) -> tuple[str, str] | None:
 
 
 def _digests_and_helpers(function: Callable[..., Any]) -> tuple[tuple[str, str] | None, list[Any]]:
-    """Return the result of `digests_of`, and the helpers of a function; each comes after the helpers that it calls."""
+    """Return two digests of a function or None, see `digests_of`, and its helpers, each after those that it calls."""
     code, closure = Digest(), Digest()
     closure.names = reachable_names(function)  # if a closure variable is a module, hash its attributes with these names
     try:

@@ -263,7 +263,10 @@ def _is_sudden_change(previous, first_value, second_value, following, limit):
 
 @compiled
 def _locate_change(f, w, low, high, k, j, q, v, a):
-    """Return the time just after column j of w.changes jumps between row k (time `low`) and row k + 1 (time `high`)."""
+    """Locate a jump by bisection between the times `low` and `high`; return the time just after it.
+
+    The value that jumps is in column j of w.changes, which contains its samples at these times in rows k and k + 1.
+    """
     changes = w.changes
     before, after = changes[k, j], changes[k + 1, j]
     for _ in range(N_BISECTIONS):

@@ -313,7 +313,7 @@ def system_storage(w, n, k):
 
 @inlined
 def _storage_after_vectors(memory, s, n, k):
-    """Return a view of 2 n numbers of `memory`, which begin k * n numbers behind the last vector (see A_NEW)."""
+    """Return a view of 2 n numbers of `memory`, from k * n numbers after the end of the vectors A_NEW to A_MID."""
     start = N_MEMORY_SCALARS + (N_BLOCKS * s + N_VECTORS + k) * n
     return memory[start : start + 2 * n]
 
