@@ -369,7 +369,7 @@ class Elimination:
         return matrix
 
     def _solve(self, r: Sequence[Affine], c: Sequence[Affine]) -> tuple[list[Affine], list[tuple[Affine, Affine]]]:
-        """Solve M a + G^T lam = r, G a = c (c: all rows); return [a, lam] and conditions of validity (see Program)."""
+        """Solve M a + G^T lam = r, G a = c, with c of redundant rows, too; return [a, lam] and conditions (see Program)."""
         return solve_refined(self.factors.solve, self.choice, self.mass, self.all_rows, r, c)
 
     def _right_sides(self, v: Sequence[Affine]) -> tuple[list[Affine], list[Affine]]:

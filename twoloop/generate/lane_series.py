@@ -207,7 +207,7 @@ class LaneSeries:
         return [self.n, self.n_rows, self.early, self.late, self.rows, self.balance, self.factor_indices]
 
     def _expressions(self, sums: Sums, rows: Sequence[int]) -> list[tuple[Terms, float]]:
-        """Return (terms, constant) of each expression in `sums`; rows[k] is the number of expression k in sums.row."""
+        """Return (terms, constant) of each expression in `sums`. In sums.row, expression k has the index rows[k]."""
         more: dict[int, list[tuple[int, float]]] = {row: [] for row in rows}
         for row, i, c in zip(
             sums.row.tolist(), sums.further_column.tolist(), sums.further_coefficient.tolist(), strict=True
@@ -500,7 +500,7 @@ class _PartialSums(NamedTuple):
         return self.sums[pair, False] + emit.load(self.first_row, x) * self.row_before.load(y)
 
     def sum_of_next_order(self, pair: tuple[int, int], row: _Row) -> Value:
-        """Return the sum of X[j] Y[k + 1 - j] over 0 < j <= k; `pair`: indices of series X, Y; `row` has X[k], Y[k]."""
+        """Return the sum of X[j] Y[k + 1 - j] over 0 < j <= k; `pair`: indices of series X, Y; `row` stores X[k], Y[k]."""
         emit, (x, y) = self.row_before.emit, pair
         total = self.sums[pair, True] + row.load(x) * emit.load(self.first_row, y)
         return total + emit.load(self.row_1, x) * row.load(y)

@@ -485,7 +485,7 @@ class IntegrationLoop:
         return [(float(t[-2]), table[-2])] if has_velocity_jump_at_end(t, table, run.system.n_q) else []
 
     def _suspicious_outputs(self, t: Array, table: Array) -> list[TimedState]:
-        """If steps end at output times, and one was near a singular position, return all output states, else []."""
+        """Return all output states if steps end at output times and passed near a singular position, else []."""
         run, request = self.run, self.request
         equal_steps = run.control[run.a.FIXED_STEP] > 0.0 and request.times is None
         if not run.passed_near_singular() or not (

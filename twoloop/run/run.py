@@ -192,7 +192,7 @@ class Run:
     ) -> int:
         """Take compiled steps to the last of `outputs`, or until Python must act; return the end code (loop_state.py).
 
-        Steps end at all times in `outputs`. States and steps are stored in `buffers`, and their numbers in `filled`.
+        A step ends at each time in `outputs`. States and steps are stored in `buffers`; `filled` counts them.
         `active`: plan, `control` and kit for this call; None: those of the run.
         """
         plan, control, kit = active or (self.plan, self.control, self.kit)

@@ -202,7 +202,10 @@ SMALL_PIVOT, PIVOT_FACTOR = 1e-5, 30.0
 
 
 def singular_threshold(rtol: float) -> float:
-    """Return min / max pivot of the Jacobian, up to WEAK_RATIO, where rounding changes v by REPORTED_ERROR * rtol."""
+    """Return the limit of (min / max pivot of C_q) below which rounding changes v by more than REPORTED_ERROR * rtol.
+
+    The limit is at least SMALL_PIVOT and at most WEAK_RATIO.
+    """
     return min(
         WEAK_RATIO, max(SMALL_PIVOT, PIVOT_FACTOR * float(np.sqrt(ROUNDING / (REPORTED_ERROR * max(rtol, ROUNDING)))))
     )

@@ -331,8 +331,9 @@ def _phase_to_begin(f, w, options, memory, tolerances, t, state, new_state):
         is_hidden = _has_small_vibrations(w, tolerances, state, memory[RATE])
         if not is_hidden:
             is_hidden = memory[RATE] > MIN_RATIO_TO_MOTION * _motion_rate(f, w, t, state, memory[RATE], Q, V, A)
-    # if a run is costly, a trial begins even if the largest rate is small: friction is stiff only while it reverses, so
-    # that estimates may miss this time. Short first steps make the expected cost too large: so require cost > min_cost
+    # if a run is costly, a trial begins even if the largest rate is small: friction is stiff only while it reverses, and
+    # all estimates may fall outside these short times. As first steps are short, `counted` may be too large early in a
+    # run; therefore cost > min_cost is also required
     is_costly = is_cheap and cost > min_cost and counted > COST_OF_ANY_TRIAL * min_cost * (1.0 + memory[N_TRIALS])
     is_due = (
         h_rho > URGENT_RATIO or is_hidden or is_costly or (memory[N_ABOVE_LIMIT] >= options[N_ESTIMATES] and is_cheap)

@@ -389,7 +389,7 @@ def rounding_floor(q):
 
 @kernel(INNER)
 def generated_inner_loop(f, w, task, t, q, v, theta, a, lam):
-    """Do a task by generated code or, if this is missing or fails, by `f.general`, for any mechanism; return a code."""
+    """Do a task by generated code or, if that is missing or fails, by `f.general`; return DONE or the reason of a failure."""
     if task == tasks.EVALUATE_WITHOUT_PROJECTION:
         w.n_evaluations += 1
         w.n_factorizations += 1

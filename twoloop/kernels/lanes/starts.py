@@ -310,7 +310,7 @@ def _gauss_newton(code, settings, control, pattern, moves, work):
                 continue
             for j in range(n):
                 work[(new + j) * LANES + k] += work[(change + j) * LANES + k]
-            # C was computed before this change. If C is a rounding error, the lane has converged; the change improves q
+            # C was computed before this change. If C was only a rounding error, the lane has converged
             if _constraints_hold(work, pattern, n, n_rows, memory, G, new, k):
                 work[at.UNCONVERGED * LANES + k] = 0.0
             else:

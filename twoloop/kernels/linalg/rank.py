@@ -224,9 +224,9 @@ def _sort_rows_by_entries(G, order, counts):
 
 @merged
 def _removes_weak_eigenvalue(A, g, scale, x):
-    """Return True if adding scale * g^T g to the mass matrix M raises an eigenvalue of M above a limit z.
+    """Return True if adding scale * g^T g to the mass matrix M raises a weak eigenvalue above the limit for weak ones.
 
-    Then det(M - z I) changes its sign. A: factors of M - z I; g: a row of the Jacobian; x: scratch.
+    Then det(M - limit I) changes its sign. A: factors of M - limit I; g: a row of the Jacobian; x: scratch.
     """
     for j in range(x.size):
         x[j] = g[j]

@@ -88,7 +88,7 @@ def _row(memory, index):
 def _difference_table(memory, n, index):
     """Return a view of difference table `index` (0 or 1): N_TERMS + 1 rows of n entries, padded to a multiple of 4.
 
-    Row i - 1 contains the predicted difference phi_i of accelerations. The final phi_i is row i - 1 plus the last row.
+    Row i - 1 contains the predicted difference phi_i of accelerations. To correct them, add the last row to each.
     """
     width = (n + 3) // 4 * 4
     start = N_SCALARS + N_ROWS * (N_TERMS + 2) + int(index) * (N_TERMS + 1) * width
