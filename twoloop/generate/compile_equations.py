@@ -36,8 +36,8 @@ from twoloop.kernels.compile.generated_functions import generated_functions
 from twoloop.problem.system import ConstrainedSystem
 
 DOUBLE_POINTER = f"{DOUBLE}*"
-# generated code is not used if the relative error of its accelerations near the start exceeds LARGEST_LOSS. The test is
-# made only if solutions are refined, or terms s g^T g (g: row of G) are added to M. In runs, errors grew up to 200-fold
+# code is not used if its accelerations near the start have a relative error above LARGEST_LOSS; later in runs, errors
+# were up to 200 times larger. Only code that refines solutions, or adds terms s g^T g to M (g: row of G), is tested
 LARGEST_LOSS = 1e-8
 MAX_POSITIONS, SPACING = 4, 0.02  # number of positions that `_relative_error` may try, and their spacing (m or rad)
 
@@ -180,7 +180,7 @@ SPLIT_PROJECTIONS, SPLIT_ALL = 200, 500
 
 
 class SplitFunctions:
-    """Generator that splits long equations into parts: LLVM functions, called for accelerations and for projections.
+    """Code generator that splits long equations into parts: LLVM functions for accelerations and for projections.
 
     The part "factors" factorizes the matrix [M G^T; G 0] of M a + G^T lam = r, G a = c, and stores the factors.
     solution : programs that compute the factors and the solution.
@@ -228,7 +228,7 @@ class SplitFunctions:
         return list(functions)
 
     def _call(self, emit: Emitter, *calls: tuple[str, Sequence[Value]]) -> Value:
-        """Write `calls` (function, arguments), and functions still missing; return a flag: 1 if all calls succeed."""
+        """Write `calls` (part, arguments), and the parts not yet written; return a flag: 1 if all calls succeed."""
         module, all_valid = emit.builder.module, None
         for part, arguments in calls:
             name = f"{part}_{emit.suffix}"
@@ -261,7 +261,7 @@ class SplitFunctions:
         return lowering.is_valid(solution.factor_program, [])
 
     def _write_part(self, program: Program, stored: Mapping[int, int], emit: Emitter, *arguments: Value) -> Value:
-        """Write code that stores the results of `program` in the last `arguments`; return a flag: 1 if they are valid.
+        """Write code that stores the results of `program` in the last `arguments`; return a flag: 1 if all are valid.
 
         Keys of `stored`: quantities that the code loads from the array `arguments[4]`; values: indices in this array.
         """
@@ -490,8 +490,8 @@ def generated_code(system: ConstrainedSystem, t0: float, q0: Array, check: Check
 def _relative_error(code: GeneratedCode, system: ConstrainedSystem, t0: float, q0: Array) -> float:
     """Return the relative error of accelerations by generated code, for velocities 0, at or near the start (t0, q0).
 
-    At most MAX_POSITIONS positions are tried until pivots are large enough; if no position has such pivots, return
-    infinity. Two generated functions compute accelerations, one of them after a projection: return the larger error.
+    If pivots are too small for the code, try the next position; return infinity after MAX_POSITIONS of them. Return the
+    larger error of two generated functions, one with projection; 0 if exact accelerations cannot be computed.
     """
     rows, n = list(code.shared.equations.choice.rows), system.n_q
     v, a, reduced, lam = np.zeros(n), np.empty(n), np.empty(n), np.empty(system.n_c + system.n_a)

@@ -373,7 +373,7 @@ class Equations:
         return jacobian
 
     def _gamma(self, rows: str, rates: str, v: Sequence[Affine]) -> Any:
-        """Return gamma = -d/dt(R v + r), v constant; `rows`: callback for R (C_q or A); `rates`: for r (C_t or b)."""
+        """Return gamma = -d/dt(R v + r) at constant v. `rows`: callback for R (C_q or A); `rates`: for r (C_t or b)."""
         direction = {only_quantity(coordinate): u for coordinate, u in zip(self.q, v, strict=True)}
         total_derivative = Derivative(self.graph, {only_quantity(self.t): Affine(self.graph, 1.0, {}), **direction})
         gamma = self.expressions(rates)
@@ -578,7 +578,7 @@ def _own_cache(system: ConstrainedSystem) -> TraceCache:
 
 
 def _parameter_groups(parameters: Array) -> NDArray[np.int64]:
-    """Return the group (see TraceCache) of each parameter: 0 for constants; equal magnitudes have the same number."""
+    """Return the group of each parameter: 0 for constants; equal magnitudes share a group. For signs see TraceCache."""
     magnitudes = np.abs(parameters)
     varies = (magnitudes > MIN_MAGNITUDE) & (magnitudes < 1.0 / MIN_MAGNITUDE) & (magnitudes != np.floor(magnitudes))
     _, first, inverse = np.unique(magnitudes[varies], return_index=True, return_inverse=True)
@@ -590,12 +590,12 @@ def _parameter_groups(parameters: Array) -> NDArray[np.int64]:
 
 
 class ParameterArrays:
-    """Arrays of numbers that stand for arrays of expressions; `write` overwrites them by values for new parameters."""
+    """Arrays of numbers that stand for arrays of expressions; `write` updates the numbers for new parameters."""
 
     def __init__(self) -> None:
-        # keys: id of an array of expressions. Values: its numbers, and the array, so that no other array gets this id
+        # keys: ids of arrays of expressions. Values: the array (stored to keep its id unique), and its array of numbers
         self._arrays: dict[int, tuple[Any, Array]] = {}
-        # for each array: its numbers; indices of those that `write` overwrites; slice of `values` in `write` for them
+        # for each array of numbers: the array, the indices that `write` overwrites, and the slice of its new `values`
         self._number_arrays: list[tuple[Array, NDArray[np.int64], slice]] = []
         self._products: dict[Powers, int] = {}
         self._scales: list[float] = []
@@ -628,7 +628,7 @@ class ParameterArrays:
         return numbers.reshape(exprs.shape)
 
     def write(self, product: Callable[[Powers], Any]) -> None:
-        """Store values for new parameters in the arrays from `array`; `product`: see TraceCache.product_evaluator."""
+        """Store values for new parameters in all arrays that `array` returned; `product`: see `product_evaluator`."""
         if self._gathered_products is None:
             return
         products, scales, product_indices = self._gathered_products

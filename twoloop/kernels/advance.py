@@ -61,7 +61,7 @@ from twoloop.kernels.linalg.dense import copy
 
 SUDDEN_ERROR = 10.0  # a force is assumed to jump within a rejected step whose error, in tolerances, exceeds this
 MAX_RATIO_AFTER_REJECTION = 0.95  # the next step size is at most this times the size of a rejected step
-FIRST_JUDGED_STEP = 2  # a trial tests the step sizes proposed from this accepted step on, as the first size is a guess
+FIRST_JUDGED_STEP = 2  # number of accepted steps before a trial judges proposed step sizes: the first size is a guess
 
 
 @kernel(i8(KIT, WORK, f8, VECTOR))
@@ -99,7 +99,7 @@ def _locate_rate_jump(f, w, t, size, tolerances, accepted, state, new_state):
 
 @merged
 def _attempt_step(f, w, options, memory, tolerances, control, clock, t, size, crosses_jump, state, new_state):
-    """Attempt a step; return a code, its error in tolerances, and (next step size) / size, which is 0 if unknown.
+    """Attempt a step; return a code, the step's error in tolerances, and (next step size) / size, or 0 if unknown.
 
     If `crosses_jump`, compute nothing: `new_state` is the state after a jump of C_t or b. Code DONE: no failure.
     """
@@ -329,7 +329,7 @@ def advance(
         error *= error_factor
         if factor == 0.0:
             factor = step_size_ratio(control, clock, size, error)
-        elif error_factor > 1.0 and error > 0.0:  # the method, which proposed `factor`, does not know `error_factor`
+        elif error_factor > 1.0 and error > 0.0:  # limit the method's `factor`, which ignores `error_factor`
             factor = min(factor, max(control[FACTOR_MIN], control[SAFETY] * error ** -control[EXPONENT]))
         proposed_size = min(size * factor, clock[at.H_LIMIT])
         if not accepted and factor > 1.0:

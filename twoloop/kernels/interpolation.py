@@ -25,8 +25,8 @@ MAX_VELOCITY_ROUNDING = 10.0
 # is below SINGULAR_PIVOT, or below SINGULAR_PIVOT_RATIO times the larger ratio at the ends of its interval
 SINGULAR_PIVOT_RATIO = 0.01
 SINGULAR_PIVOT = 1e-5
-# a position is also singular if its pivot ratio r is below WEAK_PIVOT, and r * (change of v by projection, in units of
-# the tolerances) is below MAX_VIOLATION: this product approximates the removed violation, which may then be rounding
+# a position is singular even above SINGULAR_PIVOT if its pivot ratio r is below WEAK_PIVOT, and r * (change of v by
+# projection, in tolerances) is below MAX_VIOLATION: this product estimates the violation, which may then be rounding
 MAX_VIOLATION, WEAK_PIVOT = 10.0, 0.05
 
 
@@ -47,10 +47,10 @@ def _node_range(low, high, i, last):
 def _divided_differences(t, states, lo, hi, i, h, column, order, z, c):
     """Compute the Hermite polynomials through rows lo to hi of `states`; return the number of coefficients of each.
 
-    There are n polynomials, for the n columns of `states` from index `column` on. The next n columns contain the first
-    derivatives, and the next n columns the second derivatives. Row i is subtracted from the values. `order`: 2 to
-    interpolate values and first derivatives, 3 to interpolate second derivatives, too. Store the coefficients of
-    Newton's form in c, and the interpolated times in z, as (time - t[i]) / h; h: duration of the interval.
+    There are n polynomials, for the n columns of `states` from index `column` on, minus their values in row i. The next
+    n columns contain the first derivatives, and the next n columns the second derivatives. `order`: 2 to interpolate
+    values and first derivatives, 3 to interpolate second derivatives, too. Store the coefficients of Newton's form in
+    c, and the time of each coefficient, as (time - t[i]) / h, in z; h: duration of the interval.
     """
     n = c.shape[1]
     n_coefficients = (hi - lo + 1) * order
@@ -74,10 +74,10 @@ def _divided_differences(t, states, lo, hi, i, h, column, order, z, c):
 
 @merged
 def _evaluate_polynomials(states, i, kind, h, s, z, c, size, z_v, c_v, size_v, q, v):
-    """Store in q and v the values of the polynomials of an interval at the time t[i] + s h; h: duration.
+    """Store in q and v the values of the polynomials of an interval at the fraction s of its duration h.
 
-    (z, c, size): interpolated times, coefficients and their number, for the polynomials of q. If `kind` is SEPARATE,
-    (z_v, c_v, size_v) describe polynomials of v; otherwise v is the derivative of the polynomials of q.
+    (z, c, size): times, coefficients and number of coefficients of the polynomials of q, see `_divided_differences`. If
+    `kind` is SEPARATE, (z_v, c_v, size_v) belong to polynomials of v; otherwise v is the derivative of those of q.
     """
     n = q.size
     for m in range(n):
@@ -257,13 +257,13 @@ def estimate_errors(f, w, tolerance, tolerances, t, states, groups, z, coefficie
     """For each interval g of `groups`, store in out[g] the estimated error of its polynomials, in tolerances.
 
     `tolerance`: tolerance of the projection; z, coefficients, rows: scratch. The first estimate that applies is used:
-    - 0, if the kind is SEPARATE or VELOCITIES, more than two states are interpolated, none of them inside the interval,
-      and the steps between these states are about equally long
-    - the difference from polynomials that leave out the last state, if more than two are interpolated. If it exceeds 1,
-      use the next estimate, unless the kind is VELOCITIES, whose accelerations contain noise of stiff modes
-    - the larger of two differences at CHECKED_FRACTIONS. The first one is between a state before and after projection,
-      the second one between accelerations by polynomials and by the equations of motion. With dt = h / (number of
-      coefficients), the second one times dt counts as an error of v, and times dt^2 as an error of q
+    - 0 for the kinds SEPARATE and VELOCITIES, if polynomials interpolate more than two states, all of them outside the
+      interval or at its ends, and if the steps between these states are about equally long (MAX_GAP_RATIO)
+    - the difference from polynomials that leave out the last state, if there are more than two states. If it exceeds 1,
+      use the next estimate, except for VELOCITIES, where accelerations contain noise of stiff modes
+    - the larger of two differences at CHECKED_FRACTIONS: between the state before and after projection, and between
+      accelerations by polynomials and by the equations of motion. Let dt be h / (number of coefficients): a difference
+      of accelerations times dt counts as an error of v, and times dt^2 as an error of q
     """
     n = w.Q.size
     half = z.size // 2

@@ -80,7 +80,7 @@ N_FIRST_CHUNKS = 4
 N_SKIPPED_CALLS = 16  # after an exception in a callback, this number of calls do not use the cached integrator
 STEP_FIELDS = (*STEP_ARRAYS, "stats")  # fields of a result that are computed from the array of steps
 NON_STEP_DEFAULTS = {name: value for name, value in DEFAULTS.items() if name not in STEP_FIELDS}
-SHORT_RUN = 1e-3  # if the last run took less CPU time (s), measure elapsed time, which is read faster than CPU time
+SHORT_RUN = 1e-3  # if the last run took less CPU time (s) than this, measure elapsed time, which is read faster
 HARMLESS = 0.01  # v0 need not satisfy the constraints exactly: projection may change v0 by this number of tolerances
 REACHED_END = Status.REACHED_END  # a global name is read faster than a member of an Enum
 
@@ -91,7 +91,7 @@ STEPS = OutputRequest()  # request for output at the ends of all steps, without 
 class RepeatRequest:
     """Result of a run that may have missed short changes of forces: the caller must repeat the run."""
 
-    max_gap: float  # longest time (s) that the repetition allows between two evaluations
+    max_gap: float  # longest time (s) allowed between two evaluations in the repeated run
     cpu_time: float  # CPU time of the run to be repeated (s)
 
 
@@ -125,8 +125,8 @@ class CachedIntegrator:
         self.evaluation, self.loops, self.code, self.skips = StartEvaluation(checked), cached_run(), code, 0
         self.arrays, self.callbacks = arrays_of(run, self.evaluation, code, definite, options, n_attempts), checked.kit
         self._start_and_advance = entry_point(self.loops.start_and_advance)
-        # `arrays.block` contains a report (numbers about the run, times, steps), which ends at the index states_begin,
-        # then the states. A report on one state and no step begins at one_state_begin, longer reports before this index
+        # `arrays.block` contains a report (numbers about the run, times, steps) up to the index states_begin, and
+        # states after it. A report on one state and no step begins at one_state_begin; longer ones begin earlier
         self.states_begin, self.width = self.arrays.report.size, len(run.state)
         self.one_state_begin = self.states_begin - self.loops.N_HEAD - 1
         self.loop_used = False  # True: `IntegrationLoop` may have changed attributes that `_return_to_start` restores
@@ -196,7 +196,7 @@ class CachedIntegrator:
             return None
         self.cpu_time = clock() - began
         fields: dict[str, Any] = {"status": REACHED_END}
-        n_rows, timed_states = n, None  # n: number of steps and of states after the start; n < 0: code such as REFUSED
+        n_rows, timed_states = n, None  # n steps were taken, and n states stored; n < 0: a code such as REFUSED
         rows_differ = run.rows_warning != "" and (rows := arrays.start_rows.tobytes()) != self.independent_rows
         if rows_differ and n >= 0 and rows in self.redundancy:
             self._use_independent_rows(rows)
@@ -347,7 +347,7 @@ def _deferred_field(
     options: Options,
     name: str,
 ) -> dict[str, Any]:
-    """Compute the field `name` of a result when it is first read, and similar fields; return a dict of all these."""
+    """When the field `name` of a result is first read, return a dict of this field and others from the same data."""
     if name == "message":
         return {name: describe_arrival(t1, options.step_size is not None)}
     loops, n_states, n_steps = cached_run(), int(data[0]), int(data[1])
@@ -364,7 +364,7 @@ def _deferred_field(
     return NON_STEP_DEFAULTS | state_fields(system.n_q, t, rows) | fields | options.metadata
 
 
-RECHECK_PIVOT = 0.1  # `set_up` checks a start if its smallest pivot of C_q is below this * the pivot at the first start
+RECHECK_PIVOT = 0.1  # `set_up` checks starts with a pivot of C_q below this * (smallest pivot when the run was cached)
 
 
 def arrays_of(
@@ -441,7 +441,7 @@ def _choice_as_array(choice: PivotChoice | None) -> tuple[NDArray[np.int64], flo
     """
     if choice is None:
         return np.zeros(0, dtype=np.int64), 1.0
-    # OF_PYTHON: kernels cannot choose rows for refined solutions, so Python must choose the rows at a new start
+    # OF_PYTHON: if code refines its solutions, only Python, no kernel, can choose rows and pivots at a new start
     index = cached_run().OF_PYTHON if choice.is_refined else int(np.searchsorted(-MIN_PIVOTS, -choice.min_pivot))
     numbers = index, len(choice.rows), len(choice.added_rows), *choice.rows, *choice.added_rows
     return np.array(numbers, dtype=np.int64), (*choice.scales, 1.0)[0]
@@ -453,7 +453,7 @@ MAX_OPTIONS, MAX_WORKSPACE, MAX_ENTRIES = 16, 150_000, 3
 
 
 class CacheEntry(NamedTuple):
-    """Cached run at its start, and integrators made from it that wait for the next call with the same options."""
+    """Run stored at its start, and integrators made from it that are free for the next call with equal options."""
 
     run: Run
     start: tuple[float, bytes, bytes]  # t0, and the bytes of q0 and v0

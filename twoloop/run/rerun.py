@@ -1,4 +1,4 @@
-"""Check a finished run: compare its callbacks at states of the run, and rerun pieces of the run with another method."""
+"""Check a finished run: compare its callbacks with their traces, and rerun pieces of the run with another method."""
 
 from __future__ import annotations
 

@@ -357,7 +357,7 @@ class FunctionCopier:
         return value
 
     def is_copied(self, value: Any) -> bool:
-        """Return True for values that `replacement_of` copies: compiled helpers; in a derived class, all functions."""
+        """Return whether `replacement_of` copies a value: a compiled helper or, in a derived class, any function."""
         return isinstance(value, Dispatcher) or bool(jitable_templates(value))
 
     def _copy_module(self, module: types.ModuleType, names: frozenset[str]) -> types.ModuleType:

@@ -60,11 +60,11 @@ class Work(NamedTuple):
     # and the others are 0. Last row: dependent velocities due to drives (C_t and b) if all independent ones are 0
     D: Any  # (n_dof + 1, r_v) dependent velocities per unit of each independent one; last row: those due to drives
     Gx: Any  # (n_c + n_a, n_q) constraint Jacobian at a displaced position; scratch for full pivoting
-    G_of_S: Any  # (n_c + n_a, n_q) if M is constant: the G for which S and W were computed; NaN: S and W are invalid
+    G_of_S: Any  # (n_c + n_a, n_q) if M is constant: the G in S = G M^-1 G^T and W = G M^-1; NaN: S and W are invalid
     pattern: Any  # (n_c + n_a, n_q) 1 for entries of the constraint Jacobian that have been nonzero in the run, else 0
     mass_pattern: Any  # (n_q, n_q) 1 for entries of M that have been nonzero, else 0; only in the form AUGMENTED
     row_entries: Any  # row_entries[row_entries[i] : row_entries[i + 1]]: columns of row i of G where `pattern` is 1
-    Gamma_tried: Any  # (2, n_c + n_a) Gamma by differences: with doubled time step, and with the time step tried before
+    Gamma_tried: Any  # (2, n_c + n_a) Gamma by differences. Row 0: with doubled time step; row 1: with the previous one
     rates: Any  # (13, n_c + n_a) constraint rates C_t and b at 13 times within a step, see discontinuities.py
     changes: Any  # (N_CHANGES, n_q + n_c + n_a) samples of forces and constraint rates, see discontinuities.py
     Q: Any  # (n_q) generalized forces
@@ -105,7 +105,7 @@ class Work(NamedTuple):
     factors: Any  # factors of the augmented matrix; f.ldl_program contains the index of each entry
     pivot_sizes: Any  # (n_q + n_c) squared norms of rows of C_q, to which pivots are compared, see linalg/sparse_ldl.py
     unknowns: Any  # (n_q + n_c) right-hand side when a solver is called, solution when it returns
-    solutions: Any  # (3 (n_q + n_c)) scratch; then (n_c) a number s for each row g of C_q: s g^T g is added to M
+    solutions: Any  # 3 (n_q + n_c) scratch numbers; then n_c factors s, one per row g of C_q: s g^T g is added to M
 
     sizes: Any = None  # the numbers that determine the sizes of all arrays, see `Sizes` in layout.py
     address: Any = 0  # address of the field `table` in memory; kernels receive this address as their argument `w`
@@ -199,7 +199,7 @@ OWN_FUNCTIONS = {
     "retry_nodes": types.none(*[VECTOR] * 2),  # (memory, state): store a rejected step's polynomial for a shorter step
     "end_nodes": types.none(*[VECTOR] * 3),  # (memory, state, new_state): compute the state at the end of the step
     "correct_ends": types.none(*[VECTOR] * 2),  # (memory, numbers): move the ends of 8 steps at once towards C = 0
-    "project_ends": types.none(*[VECTOR] * 2),  # (memory, numbers): project the ends of 8 steps at once; find a, lam
+    "project_ends": types.none(*[VECTOR] * 2),  # (memory, numbers): project the ends of 8 steps, and store a, lam
 }
 KIT.add_llvm_functions(OWN_FUNCTIONS)
 
@@ -307,7 +307,7 @@ class Kit:
     `functions`: callbacks and data of the system. `own`: functions generated for the mechanism, if any. `inner`: the
     inner loop, which may call `own`. `general`: the inner loop for any mechanism, for what generated code cannot do.
     `step`: functions of the method, or None if no kernel calls them. `first`, `second`: functions of two methods
-    between which the run may switch. `numbers`: data of generated functions of a state; `own_numbers`: of steps.
+    between which the run may switch. Generated functions of a state read `numbers`, those of a step `own_numbers`.
     """
 
     def __init__(
@@ -420,11 +420,11 @@ def smallest_size(tolerances):
 
 @merged
 def typical_size(tolerances, x):
-    """Return the typical size of x (q or v): max|x_k|, clipped to [`smallest_size`, 1]; 1 if x and an atol are 0.
+    """Return the typical size of x (q or v): max|x_k|, clipped to [`smallest_size`, 1]; 1 if x and any atol_k are 0.
 
     Smaller components count as this size. If it were 1 for a mechanism of 1e-9 m, finite differences would displace q
     by 1e-7 m, and a correction of 1e-14 m would count as rounding. As x may be rounding errors, such as velocities at
-    rest, the size is at least `smallest_size`, where the absolute tolerance begins to count.
+    rest, the size is at least `smallest_size`: below it, absolute tolerances exceed relative ones.
     """
     size = smallest_size(tolerances)
     for k in range(x.size):

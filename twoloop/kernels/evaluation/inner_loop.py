@@ -314,7 +314,7 @@ def evaluate(f, w, t, q, v, tolerance, a):
 
 @merged
 def evaluate_state(f, w, t, q, v, tolerance, a, lam):
-    """Compute a state at the end of a step: dependent entries of q and v up to rounding, `a` and lam; return a code."""
+    """At the end of a step, compute dependent entries of q and v up to rounding; store `a` and lam; return a code."""
     return f.inner(f, w, tasks.EVALUATE_STATE, t, q, v, tolerance, a, lam)
 
 
@@ -389,7 +389,7 @@ def rounding_floor(q):
 
 @kernel(INNER)
 def generated_inner_loop(f, w, task, t, q, v, theta, a, lam):
-    """Do a task by generated code or, if that is missing or fails, by `f.general`; return DONE or the reason of a failure."""
+    """Do a task by generated code, or by `f.general` if the code is missing or fails; return DONE or a failure code."""
     if task == tasks.EVALUATE_WITHOUT_PROJECTION:
         w.n_evaluations += 1
         w.n_factorizations += 1

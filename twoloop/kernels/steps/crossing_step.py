@@ -41,14 +41,14 @@ MAX_LEFT_OUT_NODES = 9  # a step fails if more nodes than this are left out
 # and BASE the time (s) of its argument `base`. BEGIN, DURATION and END store the beginning, duration and end (s) of the
 # polynomial that the last converged attempt computed; if there is none, END contains -inf
 LARGEST_PIVOT, EARLIEST, MAY_APPROACH, NODE_DISTANCE, BASE, BEGIN, DURATION, END, N_STORED = range(9)
-SHORTEST_PIECE, LONGEST_PIECE = 0.05, 0.2  # least and largest step along a polynomial, relative to its duration
+SHORTEST_PIECE, LONGEST_PIECE = 0.05, 0.2  # limits of (step along a polynomial) / (its duration), see `piece_ends`
 NODE_GAP = 0.0767  # longest time between two successive nodes, relative to the duration of the polynomial
-BACKWARD_FRACTION = 0.4  # largest part of the polynomial that precedes the step, relative to its whole duration
+BACKWARD_FRACTION = 0.4  # largest fraction of a polynomial's duration that may lie before the step
 ORDER, ERROR_FACTOR = 12.0, 0.5  # the error estimate has the factor ERROR_FACTOR, and is about proportional to h^ORDER
 PROJECTION_WEIGHT = 0.5  # if a projection changes a stage by x tolerances, the error estimate is at least this times x
 ROUNDING = 1e-13  # relative tolerance of the iteration in steps of fixed size, and of comparisons of times
 MIN_PIVOT_RATIO = 0.5  # a step fails if the pivot at its end is below this * pivot at its start or `base`; see FAR_END
-END_MARGIN = 2.0  # if MAY_APPROACH is 0, the end's pivot must be at least this * pivot allowed at nodes; see FAR_END
+END_MARGIN = 2.0  # if MAY_APPROACH is 0, the end's pivot must be at least this * least pivot of nodes; see FAR_END
 FAR_END = 0.3  # the pivot at the end of a step is large enough if it is at least this * largest pivot of the run so far
 LATE = S - 4  # node near a polynomial's end: if its pivot exceeds the end's, the singular position lies beyond the end
 # an attempt that computes a polynomial returns this as error and as step-size factor. So the step is repeated; it then
@@ -89,8 +89,8 @@ def begin_polynomial(memory, largest_pivot, earliest, may_approach, node_distanc
 def piece_ends(memory, c, t):
     """Divide the polynomial in `memory`, from t on, into steps ("pieces"); return the times (s) at which they end.
 
-    Pieces end at the end of the polynomial, at evaluated nodes next to a node that is left out, and at evaluated nodes
-    where the piece would otherwise be longer than LONGEST_PIECE. No piece is shorter than SHORTEST_PIECE.
+    Pieces end at the end of the polynomial, at evaluated nodes next to a node that is left out, and at the first
+    evaluated node where the piece is longer than LONGEST_PIECE. No piece is shorter than SHORTEST_PIECE.
     """
     stored = memory[-N_STORED:]
     left_out = memory[-N_STORED - 3 * S : -N_STORED - 2 * S] < 0.0
@@ -171,9 +171,9 @@ def _choose_partition_at_end(
 ):
     """Set (q1, v1) to the end (at time t) of the polynomial of duration h; choose the partition there; return a code.
 
-    The code is SINGULAR if the pivot at the end is below `min_pivot`, and below FAR_END times the run's largest pivot:
-    the end is too near the singular position, or before it. If MAY_APPROACH is 0, two values replace `min_pivot` if
-    larger: the pivot at the node LATE, and END_MARGIN times the pivot `min_node_pivot`, below which nodes are left out.
+    The code is SINGULAR if the pivot at the end is below both `min_pivot` and FAR_END * largest pivot of the run: the
+    end is too near the singular position, or before it. If MAY_APPROACH is 0, `min_pivot` is raised to at least the
+    pivot at the node LATE, and at least END_MARGIN * `min_node_pivot`, the pivot below which nodes are left out.
     """
     A, AA, b, bA, c = tables
     if stored[MAY_APPROACH] == 0.0:
@@ -212,7 +212,7 @@ def _set_beginning_state(h, c0, weights_v, weights_q, a, q, v, q_0, v_0):
 
 @compiled
 def _interpolate(x, c, nodes, a, value):
-    """Set `value` (n) to the value at x of the polynomial through a[k] (n) at c[k], for all k in `nodes` except -1."""
+    """Store in `value` the value at time x of the polynomial through a[k] at time c[k], for all k >= 0 in `nodes`."""
     value[:] = 0.0
     for node in nodes:
         if node >= 0:
@@ -293,7 +293,7 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
     b, bA, c = options[N_SCALARS + 3 * S * S :].reshape((3, S))
     a, stage, offset = memory[: S * n].reshape((S, n)), memory[S * n : (S + 5) * n].reshape((5, n)), (S + 7) * n
     q_stage, v_stage, a_stage, q_0, v_0 = stage[0], stage[1], stage[2], stage[3], stage[4]
-    kept, weights_v, weights_q = memory[offset : offset + 3 * S].reshape((3, S))  # kept[j]: j; -1 if node j is left out
+    kept, weights_v, weights_q = memory[offset : offset + 3 * S].reshape((3, S))  # kept[j] = j; -1: node j is left out
     stored = memory[offset + 3 * S :]
     largest_pivot, earliest, time_of_base = stored[LARGEST_PIVOT], stored[EARLIEST], stored[BASE]
     is_estimated, uses_generated_code = tolerances[ESTIMATE] == 1.0, f.is_generated == 1
