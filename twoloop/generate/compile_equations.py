@@ -36,8 +36,8 @@ from twoloop.kernels.compile.generated_functions import generated_functions
 from twoloop.problem.system import ConstrainedSystem
 
 DOUBLE_POINTER = f"{DOUBLE}*"
-# code is not used if its accelerations near the start have a relative error above LARGEST_LOSS; later in runs, errors
-# were up to 200 times larger. Only code that refines solutions, or adds terms s g^T g to M (g: row of G), is tested
+# generated code is not used if its accelerations near the start have a relative error above LARGEST_LOSS; in runs,
+# errors were up to 200 times larger. Only code that refines solutions, or adds s g^T g to M (g: row of G), is tested
 LARGEST_LOSS = 1e-8
 MAX_POSITIONS, SPACING = 4, 0.02  # number of positions that `_relative_error` may try, and their spacing (m or rad)
 
@@ -164,7 +164,7 @@ def _acceleration_function(emit: Emitter, equations: Elimination, index: int, nu
 
 
 def _coefficient_pointers(emit: Emitter) -> list[Value]:
-    """Return a pointer to all coefficients; in SIMD lanes, two: to those that vary between lanes, and to the others."""
+    """Return a pointer to all coefficients; in SIMD lanes, one to those that vary between lanes, one to the others."""
     constants = getattr(emit, "constants", None)
     return [emit.numbers] if constants is None else [emit.numbers, constants]
 

@@ -302,7 +302,7 @@ def _binary_operator(name: str, swapped: bool) -> Callable[[Parameter, Any], Any
         pair = (other, self) if swapped else (self, other)
         if issubclass(type(other), np.ndarray):
             return self.__array_ufunc__(getattr(np, name), "__call__", *pair)
-        if not issubclass(type(other), NUMBER_TYPES):  # not by isinstance(), which symbols refuse
+        if not issubclass(type(other), NUMBER_TYPES):  # symbols refuse isinstance()
             return NotImplemented
         return operation(*(x if type(x) is Parameter else float(x) for x in pair))
 
@@ -342,7 +342,7 @@ def elementwise(function: Callable[..., Any], inputs: Iterable[Any], out: Any = 
 
 
 def _object_array(value: Any) -> Any:
-    # type() instead of isinstance(), which symbols refuse
+    # call type(), because symbols refuse isinstance()
     if issubclass(type(value), np.ndarray):
         return value.astype(object)
     array = np.empty((), dtype=object)

@@ -595,7 +595,7 @@ class ParameterArrays:
     def __init__(self) -> None:
         # keys: ids of arrays of expressions. Values: the array (stored to keep its id unique), and its array of numbers
         self._arrays: dict[int, tuple[Any, Array]] = {}
-        # for each array of numbers: the array, the indices that `write` overwrites, and the slice of its new `values`
+        # (array of numbers, indices of entries that `write` overwrites, slice of `values` in `write` with new entries)
         self._number_arrays: list[tuple[Array, NDArray[np.int64], slice]] = []
         self._products: dict[Powers, int] = {}
         self._scales: list[float] = []

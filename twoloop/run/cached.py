@@ -524,7 +524,7 @@ def set_up(
     A run is cached if twoloop provides the method, callbacks are compiled, and callbacks agree with their traces. Raise
     TypeError or ValueError if the start is refused, the method cannot run the system, or code cannot be generated.
     """
-    if system.called_in_python:  # not cached: Python functions may depend on variables that change
+    if system.called_in_python:  # do not cache the run: Python functions may depend on variables that change
         return _new_run(system, t0, t1, q0, v0, options)[0], None
     start, key = (t0, q0.tobytes(), v0.tobytes()), options.key
     last_start, runs, last_code = system.derived.get("runs", EMPTY_CACHE)

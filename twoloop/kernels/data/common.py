@@ -64,7 +64,7 @@ class Work(NamedTuple):
     pattern: Any  # (n_c + n_a, n_q) 1 for entries of the constraint Jacobian that have been nonzero in the run, else 0
     mass_pattern: Any  # (n_q, n_q) 1 for entries of M that have been nonzero, else 0; only in the form AUGMENTED
     row_entries: Any  # row_entries[row_entries[i] : row_entries[i + 1]]: columns of row i of G where `pattern` is 1
-    Gamma_tried: Any  # (2, n_c + n_a) Gamma by differences. Row 0: with doubled time step; row 1: with the previous one
+    Gamma_tried: Any  # (2, n_c + n_a) Gamma by differences. Row 0: doubled time step; row 1: time step tried before
     rates: Any  # (13, n_c + n_a) constraint rates C_t and b at 13 times within a step, see discontinuities.py
     changes: Any  # (N_CHANGES, n_q + n_c + n_a) samples of forces and constraint rates, see discontinuities.py
     Q: Any  # (n_q) generalized forces
@@ -420,7 +420,7 @@ def smallest_size(tolerances):
 
 @merged
 def typical_size(tolerances, x):
-    """Return the typical size of x (q or v): max|x_k|, clipped to [`smallest_size`, 1]; 1 if x and any atol_k are 0.
+    """Return the typical size of x (q or v): max|x_k|, clipped to [`smallest_size`, 1]; 1 if x = 0 and any atol_k = 0.
 
     Smaller components count as this size. If it were 1 for a mechanism of 1e-9 m, finite differences would displace q
     by 1e-7 m, and a correction of 1e-14 m would count as rounding. As x may be rounding errors, such as velocities at

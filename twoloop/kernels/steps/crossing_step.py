@@ -41,7 +41,7 @@ MAX_LEFT_OUT_NODES = 9  # a step fails if more nodes than this are left out
 # and BASE the time (s) of its argument `base`. BEGIN, DURATION and END store the beginning, duration and end (s) of the
 # polynomial that the last converged attempt computed; if there is none, END contains -inf
 LARGEST_PIVOT, EARLIEST, MAY_APPROACH, NODE_DISTANCE, BASE, BEGIN, DURATION, END, N_STORED = range(9)
-SHORTEST_PIECE, LONGEST_PIECE = 0.05, 0.2  # limits of (step along a polynomial) / (its duration), see `piece_ends`
+SHORTEST_PIECE, LONGEST_PIECE = 0.05, 0.2  # limits of (size of a piece) / (duration of polynomial), see `piece_ends`
 NODE_GAP = 0.0767  # longest time between two successive nodes, relative to the duration of the polynomial
 BACKWARD_FRACTION = 0.4  # largest fraction of a polynomial's duration that may lie before the step
 ORDER, ERROR_FACTOR = 12.0, 0.5  # the error estimate has the factor ERROR_FACTOR, and is about proportional to h^ORDER
@@ -276,7 +276,7 @@ def state_at(memory, options, t):
     b, _, c = options[N_SCALARS + 3 * S * S :].reshape((3, S))
     a, stage = memory[: S * n].reshape((S, n)), memory[S * n : (S + 5) * n].reshape((5, n))
     fraction, duration, (q_0, v_0) = (t - stored[BEGIN]) / stored[DURATION], stored[DURATION], stage[3:]
-    # values of the Lagrange polynomials at S Gauss nodes between the polynomial's beginning and t, and at t (last row)
+    # row k: values of the Lagrange polynomials at Gauss node k of the time from stored[BEGIN] to t; last row: at t
     weights = np.array([lagrange_values(c, x) for x in (*(fraction * c), fraction)])
     weights_v = fraction * b @ weights[:-1]
     weights_q = fraction**2 * (b * (1.0 - c)) @ weights[:-1]
