@@ -87,7 +87,7 @@ def _derive_programs(system: ConstrainedSystem, missing: Sequence[str], cache: T
 
 
 def _missing_derivatives(equations: Equations, missing: Sequence[str]) -> dict[str, dict[int, Affine]]:
-    """Return missing derivatives as {flat index: expression}: "gamma" (of C, then A), "jacobian" (nonzero entries)."""
+    """Return missing derivatives, "gamma" (of C, then of A) and "jacobian" (nonzeros), as {flat index: expression}."""
     system = equations.system
     gamma: dict[int, Affine] = {}
     for kind, first in (("gamma", 0), ("nonholonomic_gamma", system.n_c)):

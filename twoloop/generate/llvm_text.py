@@ -211,7 +211,7 @@ class Builder:
         arguments = ", ".join(map(str, self.arguments))
         body = "\n".join(block.text() for block in self._blocks)
         linkage = "internal " if self.internal else ""
-        # without this alignment, vectors on the stack cross two cache lines, and take twice as long to load and store
+        # if the stack is not aligned, a vector on it lies in two cache lines, and takes twice as long to load and store
         attributes = "noinline alignstack(64)" if f"<{DOUBLES_PER_CACHE_LINE} x" in body else "noinline"
         return f"define {linkage}{self.result} @{self.name}({arguments}) {attributes} {{\n{body}\n}}"
 
@@ -348,7 +348,7 @@ class Builder:
 
     @contextmanager
     def if_then(self, condition: Value) -> Iterator[None]:
-        """Return a context manager; instructions that are appended in its block run only if `condition` is true."""
+        """Return a context manager: instructions appended in its `with` block run only if `condition` is true."""
         then, after = self.append_block(), self.append_block()
         self.branch(condition, then, after)
         self.position_at_end(then)

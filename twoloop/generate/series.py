@@ -47,8 +47,8 @@ class Sums(NamedTuple):
 class OperationGroups:
     """Operations in groups, in the order of their computation; their results are consecutive quantities.
 
-    groups : array with a row for each group: kind, begin and end of its operations; begin and end of their terms in the
-        arrays further_... of `first`, then of `second`. The operations of a group are of one kind, such as SINE, and do
+    groups : array; each row describes a group by its kind, and by (begin, end) of its operations, of the further terms
+        of `first` (see Sums), and of those of `second`. The operations of a group are of one kind, such as SINE, and do
         not need the results of each other. Sines and cosines of the same angles form one group. The last group has the
         products with v, lam or a: their coefficients are known only after the linear system of an order is solved.
     first, second : first and second argument of each operation.
@@ -65,7 +65,8 @@ class SeriesProgram:
 
     early : operations that depend on t and q only; after them, the products in G v.
     late : operations that depend on v, too; after them, the products in G^T lam + M a.
-    rows, row_indices : nonzero rows of G v + (C_t, b), without terms "constant times v_i", and their indices.
+    rows, row_indices : nonzero rows of G v + (C_t, b), and their indices. Terms "constant times v_i" are left out,
+        because only the matrix of the linear system of each order contains their coefficients.
     balance, balance_indices : nonzero rows of Q - G^T lam - M a, without "constant times lam_i or a_i", and indices.
     traced : traces of the callbacks, for a comparison with calls; None: nothing is compared.
     """
@@ -225,9 +226,9 @@ def _sum_of_products(
 
 
 def _normalized_product(factor: Affine, multiplier: Affine) -> tuple[Any, float, Affine, Affine]:
-    """Write factor * multiplier as scale * first * second, where scale is a number; return (key, scale, first, second).
+    """Return (key, scale, first, second) with factor * multiplier = scale * first * second; scale is a number.
 
-    Products that differ only by the number `scale` have equal keys, so that one operation computes them.
+    Products that differ only by `scale` have equal keys, so that one operation computes them.
     """
     scale, multiplier = multiplier.normalized()
     return (factor.key, multiplier.key), scale, factor, multiplier

@@ -74,8 +74,8 @@ FIRST_STEP = 0.01  # first step size, relative to the shortest time scale of the
 MIN_FIRST_STEP = 1e4  # smallest first step size, in spacings of floating-point numbers at the start time
 MIN_GAP = 40.0  # the allowed time between evaluations is at least this number of spacings of floating-point times
 SHORTEST_STEP = 1e-16  # a run fails if a step would be shorter than this fraction of the first step
-# ratio of two longest allowed times (s) between evaluations, if forces may change suddenly with q or v: the time in
-# steps that do not check their defect (GAP) to the time in steps that do (DEFECT_GAP)
+# GAP is the longest allowed time (s) between evaluations; DEFECT_GAP replaces it in steps that check their defect. If
+# forces may change suddenly with q or v, DEFECT_GAP is GAP / GAP_RATIO; if not, both times are equal
 GAP_RATIO = 10
 
 
@@ -187,30 +187,30 @@ RUN_ARRAYS.add_function("advance", i8(KIT, WORK, *(VECTOR,) * 9, MATRIX, MATRIX,
 # indices in `constants`, the settings of runs; G are the constraint rows [C_q; A]
 (
     ACCURACY,  # initial w.gamma_required: allowed relative error of gamma, if finite differences yield it
-    REUSE,  # initial w.reuse: after a smaller correction of positions, the inner loop does not evaluate C_q again
+    REUSE,  # initial w.reuse: after a correction of q of at most this, the inner loop does not evaluate C_q again
     NEARLY_SINGULAR,  # initial w.nearly_singular. 0: short steps trigger checks for singular positions; 1: they do not
     HAS_ALL_ENTRIES,  # 1: the array `kinds` shows all entries of G that may be nonzero; 0: search for them at the start
     RANK_LIMIT,  # a row of G is redundant if its part orthogonal to previous rows is at most this fraction of its norm
     WEAK_LIMIT,  # M counts as singular if the ratio of its smallest to its largest eigenvalue is below this
     ADDED_SCALE,  # factor s: for a singular M, generated code uses M + s g^T g instead, where g are some rows of G
     CONTRADICTS,  # a start is refused if a residual of G a = gamma exceeds this times max(1, sum of |terms| in the row)
-    MASS_FLAG,  # a start is refused unless the check of M gives this, DEFINITE or INDEFINITE; 0: constant M, no check
+    MASS_FLAG,  # flag that M must have, or the start is refused: DEFINITE, INDEFINITE; 0: M is constant, without a flag
     LEAST_PIVOT,  # a start is refused if the smallest pivot of C_q at the start is below this
     EQUATION_FORM,  # initial f.form, the algebra that solves for accelerations
     FIRST_SIZE,  # first step size (s) chosen by the user; 0: `_first_step_size` computes it
-    LEAST_DISTANCE,  # argument `smallest` of _first_step_size: displacement that is used there if max|q| is smaller
+    LEAST_DISTANCE,  # argument `smallest` of _first_step_size, which replaces max|q| if max|q| is below it
     LONGEST,  # longest step (s): argument `longest` of _set_step_limits
     EVALUATES_WITHIN,  # 1: the method adds evaluations within long steps; 0: it does not, which limits the step size
     NEAR_PIVOT,  # Python must check a run if, at an output time, (smallest / largest pivot of C_q) is below this
-    MAX_CHANGE_RATIO,  # velocities jump in a step if max|change| > this * (step size) * (smaller max|a| of both ends)
+    MAX_CHANGE_RATIO,  # v jumps in a step if max|change of v| > this * (step size) * min(max|a| at its two ends)
     MIN_SAMPLES,  # Python must check a run if two sudden changes of a force, C_t or b are closer than this many samples
 ) = range(18)
 # indices in `expected`, which lists the constraint rows that generated code uses (empty without generated code)
 (
-    BOUND,  # index in MIN_PIVOTS (generate/elimination.py) of the code's pivot limit; OF_PYTHON: Python chooses rows
+    BOUND,  # generated code needs pivots above MIN_PIVOTS[this] (elimination.py); OF_PYTHON: Python must choose rows
     N_ROWS,  # number of independent rows
     N_ADDED,  # number of rows g that are added to a singular M as s g^T g
-    FIRST_ROW,  # index where the list of independent rows begins; the list of rows g, added to M as s g^T g, follows
+    FIRST_ROW,  # from this index on, `expected` lists the independent rows, then the rows g added to M as s g^T g
 ) = range(4)
 OF_PYTHON = 100
 
@@ -275,7 +275,7 @@ def _start_run(f, checked_kit, w, b, t, t1, q, v, records, checks):
     )
     if has_all_entries:
         pattern = b.pattern.reshape(b.pattern.size)
-        for k in range(b.kinds.size):  # for each entry of [C_q; A]: kind 0 if it is always zero
+        for k in range(b.kinds.size):  # b.kinds[k] is 0 if entry k of [C_q; A] is always zero
             pattern[k] = 1.0 if b.kinds[k] != 0 else pattern[k]
     if flags & WELL_FORMED == 0 or flags & (DEFINITE | INDEFINITE) != int(b.constants[MASS_FLAG]):
         return REFUSED

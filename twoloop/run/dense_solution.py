@@ -117,7 +117,7 @@ class Interpolator:
         from twoloop.kernels import advance
 
         system, t0, row = self.arguments[:3]
-        self.work.notes[indices.GENERATION] = 1.0  # number of partitions so far; above 0, kernels use `self.ranks`
+        self.work.notes[indices.GENERATION] = 1.0  # as after a first partition: kernels must keep `self.ranks`
         state = np.concatenate([row, np.zeros(system.n_c + system.n_a)])
         entry_point(advance.start)(self.kit, self.work, t0, state)
         self.repair_plans: dict[bool, tuple[Plan, Any]] = {}
@@ -305,7 +305,7 @@ class Interpolator:
         return times, states
 
     def _plan_for_repair(self, kind: int) -> tuple[Plan, Any]:
-        """Return the plan and the kit that divide an interval of this kind into N_REPAIR_STEPS steps."""
+        """Return the plan and the kit for dividing an interval of this kind into N_REPAIR_STEPS steps."""
         is_stiff = kind == indices.VELOCITIES
         if is_stiff not in self.repair_plans:
             from twoloop.methods.dop853 import DOP853
@@ -563,7 +563,7 @@ class DenseSolution:
     >>> state = result.sol([0.25, 0.5])
     >>> state.q.shape, state.lam.shape
     ((9, 2), (8, 2))
-    >>> bool(abs(problem.system.constraint(0.25, state.q[:, 0])).max() < 1e-12)  # closed between steps
+    >>> bool(abs(problem.system.constraint(0.25, state.q[:, 0])).max() < 1e-12)  # the loop stays closed
     True
     """
 

@@ -121,13 +121,13 @@ class Run:
         self.sizes_to_try: list[float] = []  # step sizes (s) still to be tried across a singular position
         self.attempts_left = np.inf  # the search for a step across a singular position ends after so many failures
         self.crossing_size = 0.0  # size (s) of the last attempted step across a singular position
-        self.piece_ends: list[float] = []  # remaining end times (s) of steps that divide a crossing's polynomial
+        self.piece_ends: list[float] = []  # end times (s) of steps still to be taken along a crossing's polynomial
         self.origins: list[Any] = []  # the `Origin` of each polynomial that is still to be tried for a crossing
         self.t1 = np.inf  # end of the run (s)
         self.starts_singular = False  # whether the start is a singular position: nearby, C_q has a higher rank
         self.branch_known = False  # whether it is known on which branch the motion leaves a singular start
         self.jumps: list[float] = []  # times (s) at which velocities jumped because C_t, or b in A v + b = 0, jumped
-        self.compared_until = [-np.inf]  # callbacks agreed with traces up to this time (s); run copies share the list
+        self.compared_until = [-np.inf]  # callbacks agreed with traces up to this time (s); copies share the list
         self.region: CheckedRegion | None = None  # where callbacks agreed with traces; None: the system's region
         self.varied_parameters: Array | None = None  # current parameters in a ParametricRun; None in other runs
         self._compute_start_accelerations()
@@ -143,7 +143,7 @@ class Run:
         return new_run
 
     def copy_to_start(self, t0: float, q0: Array, v0: Array) -> "Run | None":
-        """Return a copy of this run at another start; None if ranks differ from this run's, or accelerations fail.
+        """Return a copy of this run at another start; None if constraints have other ranks there, or `restart` fails.
 
         The run must not use the fixed-order form (sparse factors in a fixed order of elimination).
         """
@@ -287,7 +287,7 @@ class Run:
         if code == indices.RANK_DIFFERS:  # keep the rank at the start of the run, even if the rank is higher now
             self.work.notes[indices.GENERATION] = 1.0
             code = entry_point(self.kernels.start)(self.kit, self.work, t, state)
-        if old_work.notes[indices.PIVOT] > 0.0 and largest_pivot > 0.0:  # pivots of the new form have another scale
+        if old_work.notes[indices.PIVOT] > 0.0 and largest_pivot > 0.0:  # rescale the largest pivot for the new form
             pivot = self.work.notes[indices.PIVOT]
             self.clock[self.a.LARGEST_PIVOT] = pivot * max(1.0, largest_pivot / old_work.notes[indices.PIVOT])
 
@@ -300,7 +300,7 @@ class Run:
             self.work = self._make_workspace(rank, rank)
             code = start(self.kit, self.work, self.t0, self.state)
         if self.fixed_order is not None and code not in (indices.DONE, indices.NOT_FINITE):
-            if self.work.notes[indices.SMALLEST] < 0.0:  # M is not definite: no fixed-order form in later runs
+            if self.work.notes[indices.SMALLEST] < 0.0:  # M is not definite: later runs must not use this form
                 self.system.derived["fixed-order form"] = None
             self.fixed_order = None
             self.kit = make_kit(self.system, self.t0, self.state[: self.system.n_q], self.plan)
@@ -336,7 +336,7 @@ class Run:
         )
 
     def find_redundant_rows(self) -> tuple[NDArray[np.int64], str]:
-        """Return indices of redundant rows at the start, and a warning or ""; raise ValueError if rows contradict."""
+        """Return indices of redundant rows at the start, and a warning or ""; ValueError if rows are contradictory."""
         n_rows = self.system.n_c + self.system.n_a
         if self.rank == n_rows:
             return np.zeros(0, dtype=np.int64), ""
@@ -385,7 +385,7 @@ class Run:
         if self.fixed_order is None or set(rows) & set(independent_rows):
             return describe_dependence(self.system.rows(self.t0, q), rows)
         factors, zero, x = np.zeros((min(SHOWN, len(rows)), len(all_rows))), np.zeros(len(all_rows)), np.zeros_like(q)
-        for row, factor in zip(rows, factors, strict=False):  # find coefficients: row = factor @ independent rows
+        for row, factor in zip(rows, factors, strict=False):  # fill `factor`: row = factor @ independent rows
             entry_point(self.kit.inner)(self.kit, self.work, SOLVE, self.t0, all_rows.row(row), zero, 0.0, x, factor)
         return describe_equations(rows, independent_rows, factors[:, independent_rows], norms(all_rows))
 
@@ -399,10 +399,10 @@ class Run:
         self.control[self.a.SHORTEST] = cached_run().SHORTEST_STEP * first_size
 
     def limit_steps(self) -> None:
-        """Limit step sizes so that forces are evaluated at least every hundredth of the run, to detect short forces.
+        """Limit step sizes so that two evaluations of forces are at most 1 % of the run apart, to detect short forces.
 
-        If forces may vary much within a step, steps are at most a hundredth of the run, unless the method evaluates
-        forces within its steps: one evaluation alone may not detect a short force.
+        If forces may vary much within a step, one evaluation at a stage may not detect a short force: then the step
+        size itself is at most 1 % of the run. Methods that add evaluations within long steps need no limit.
         """
         gap = 1.0 if self.forces_may_be_steep else self.plan.max_gap
         max_size = np.inf if self.plan.evaluates_within else self.tolerances[indices.GAP] / gap

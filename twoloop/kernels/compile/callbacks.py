@@ -148,7 +148,7 @@ class CallbackKind:
 
     @property
     def optional(self) -> bool:
-        """Return False if all systems must have this callback; True if none must, or only some (see `needed_by`)."""
+        """Return True if systems may lack this callback; those whose size `needed_by` is not 0 must still have it."""
         return self.absent != ""
 
     @cached_property

@@ -209,7 +209,7 @@ _RULES: list[tuple[Any, str, Callable[..., Any]]] = [
     (event, "start_event", _skip_lock_events(event.start_event)),
     (event, "end_event", _skip_lock_events(event.end_event)),
 ]
-_MISSING_ATTRIBUTE = object()  # stands for an inherited attribute: its replacement will be deleted, not reset
+_MISSING_ATTRIBUTE = object()  # means that a class inherits the attribute: its replacement must be deleted later
 _depth = [0]  # number of active contexts `kernel_rules`; only the outermost one replaces and restores functions
 
 
@@ -342,7 +342,7 @@ def entry_point(function: Dispatcher) -> Any:
     return compiled.entry_point
 
 
-# address of machine code, by compiled function: one address, because each function is compiled for one signature
+# addresses of machine code; a compiled function has only one, because it is compiled for one signature only
 _ADDRESSES: WeakKeyDictionary[Dispatcher, int] = WeakKeyDictionary()
 
 

@@ -224,7 +224,7 @@ def write_programs(w):
 
 @compiled
 def _record_columns_of_entries(w):
-    """Store in w.row_entries[w.row_entries[i] : w.row_entries[i + 1]] the columns in which row i of w.pattern is 1."""
+    """Store the columns of the ones in w.pattern, row by row, in w.row_entries; row i begins at index w.row_entries[i]."""
     n_rows = w.Rate.size
     index = n_rows + 1
     for i in range(n_rows):

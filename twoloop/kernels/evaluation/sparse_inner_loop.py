@@ -189,7 +189,7 @@ def _sine_to_independent_rows(f, w, row, square):
             x[columns[k]] += w.jacobian_values[k]
     solve_unknowns(f, w, 2)
     rows, columns, _ = mass_entries_of(f.ldl_program)
-    for k in range(rows.size):  # x^T M x (x: solution): squared norm of the row's part orthogonal to independent rows
+    for k in range(rows.size):  # with the solution x, x^T M x is |component of row g orthogonal to independent rows|^2
         part += x[rows[k]] * w.mass_values[k] * x[columns[k]]
     return np.sqrt(part / square) if square > 0.0 else 0.0
 
@@ -213,7 +213,7 @@ def _choose_rows(f, w, t, q):
     if not _factor_entries(f, w, SUSPECT_PIVOT) > 0.0:
         return _failure_of_factorization(w, t, q)
     order, n_q = pivot_order_of(f.ldl_program), w.Q.size
-    copy(w.is_independent, w.z)  # w.z (scratch): 0 for rows with small pivots, which are checked below
+    copy(w.is_independent, w.z)  # w.z (scratch) marks rows with small pivots by 0; the loop checks these rows
     for k in range(order.size):
         row = order[k] - n_q
         if row < 0 or w.z[row] != 0.0:
@@ -293,7 +293,7 @@ def _fill_least_norm_matrix(program, jacobian, n_q, weights, values):
 
 @compiled
 def _fill_residual(program, jacobian, force, x, r):
-    """Store in r the residual of the equations for multipliers of least norm; return its size relative to reactions.
+    """Store in r the residual of the equations that yield the multipliers of least norm; return its relative size.
 
     See the module docstring: the residual is [p - G^T lam, lam - G y], its relative size max|p - G^T lam| / max|p|.
     x: approximate solution [y, lam]. p (`force`): reactions that lam must have. `jacobian`: entries of C_q = G.
@@ -506,7 +506,7 @@ def _check_redundant_rows(f, w, t, q, v):
 
 @compiled
 def _do_task_between_evaluations(f, w, task, t, q, v, a, lam):
-    """Do a task from FIND_NULL_SPACE on, see tasks.py; return a code: NEEDS_DENSE if only dense forms can do it."""
+    """Do one of the tasks FIND_NULL_SPACE to SOLVE in tasks.py; return a code: NEEDS_DENSE if it needs dense forms."""
     if task == tasks.FIND_NULL_SPACE:
         return factor_equations_at(f, w, t, q)
     if task == tasks.RENEW_PARTITION:

@@ -58,10 +58,10 @@ LANES = 8 if has_wide_vectors() else 4  # number of runs at once: the number of 
     H_LIMIT,  # upper limit of step sizes (s), set by a failed step; infinity: no limit
     LIMIT_AGE,  # number of accepted steps since H_LIMIT was set
     JUMP_END,  # time (s) at the end of the last step that was rejected with an error above SUDDEN_ERROR
-    SHIFT,  # number from 0 to 1 that shifts the times within a step at which the defect is evaluated
+    SHIFT,  # the times at which the defect within a step is evaluated are shifted in proportion to 2 SHIFT - 1
     EVALUATED,  # number of evaluations within the step, in addition to settings[N_EVALUATIONS]
     DISPLACED,  # typical size of q (or v): finite differences displace smaller components as if they had this size
-    LARGEST,  # largest |component| of q (or v), which finite differences displace
+    LARGEST,  # largest |component| of the vector, q or v, that finite differences displace
     PAST,  # size and error of the last accepted step, for step-size control: both of lane 0, then both of lane 1, ...
     _MORE_PAST,
     N_FIELDS,
@@ -188,7 +188,7 @@ def add_product(work, target, x, y, sign):
 
 @merged
 def _raised_value(work, target, error, factor, before, after, atol, rtol):
-    """Return the larger of work[target] and the ratio of `raise_to_ratio`; indices of `work` replace its offsets."""
+    """Return the larger of work[target] and |work[error]| * work[factor] / (allowed error), see `raise_to_ratio`."""
     allowed_error = atol + rtol * max(abs(work[before]), abs(work[after]))
     return max(work[target], abs(work[error]) * work[factor] / allowed_error)
 
@@ -255,8 +255,7 @@ def _pivot_magnitude(work, entry, imaginary, k):
 def _choose_pivot(work, matrix, pivots, n, imaginary, c):
     """In each lane, find the pivot (largest entry of column c from row c on), exchange rows, and invert the pivot.
 
-    Row c is exchanged with the pivot's row, whose index is stored in `pivots`. If the pivot is 0, set ACTIVE to 0. If
-    `imaginary` > 0, entries are complex, with imaginary parts `imaginary` vectors after the real parts.
+    Row c is exchanged with the pivot's row, whose index is stored in `pivots`. If the pivot is 0, set ACTIVE to 0.
     """
     for k in range(LANES):
         best, largest = c, _pivot_magnitude(work, matrix + c * n + c, imaginary, k)

@@ -81,9 +81,9 @@ def factor(program, is_independent, values, sizes, min_sine_square):
     """Replace the matrix in `values` by its factors; return the smallest squared sine of angles between rows of G.
 
     The angle is between a row and the span of previous rows. Its squared sine is -pivot / (squared norm of the row).
-    The squared norms are stored in `sizes`, 1 / pivot in the diagonal of the factors. On entry, `is_independent` is 0
-    for rows that count as redundant. It is set to 0 for rows with a squared sine of at most `min_sine_square`. The
-    factors of rows with 0 are 0. If the pivot of a coordinate is not positive (M not definite), return NOT_DEFINITE.
+    The squared norms are stored in `sizes`, 1 / pivot in the diagonal of the factors. Rows with is_independent = 0 on
+    entry are redundant. Rows with a squared sine of at most `min_sine_square` are redundant, too, and get the value 0.
+    Factors of redundant rows are 0. If the pivot of a coordinate is not positive (M not definite), return NOT_DEFINITE.
     """
     (n_q, n) = program[N_COORDINATES], program[N_PIVOTS]
     order, runs = pivot_order_of(program), update_runs_of(program)

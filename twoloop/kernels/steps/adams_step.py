@@ -88,7 +88,7 @@ def _row(memory, index):
 def _difference_table(memory, n, index):
     """Return a view of difference table `index` (0 or 1): N_TERMS + 1 rows of n entries, padded to a multiple of 4.
 
-    Row i - 1 contains the predicted difference phi_i of accelerations. To correct them, add the last row to each.
+    Row i - 1 contains the predicted difference phi_i of accelerations. The last row is the correction to add to each.
     """
     width = (n + 3) // 4 * 4
     start = N_SCALARS + N_ROWS * (N_TERMS + 2) + int(index) * (N_TERMS + 1) * width
@@ -97,7 +97,7 @@ def _difference_table(memory, n, index):
 
 @inlined
 def _scratch_rows(memory, n):
-    """Return two scratch rows (n, padded), for means of accelerations in a step, later for 1 / (allowed errors)."""
+    """Return two padded scratch rows (n): first for mean accelerations in a step, later for 1 / (allowed errors)."""
     width = (n + 3) // 4 * 4
     start = N_SCALARS + N_ROWS * (N_TERMS + 2) + 2 * (N_TERMS + 1) * width
     return memory[start : start + width], memory[start + width : start + 2 * width]
