@@ -66,7 +66,7 @@ class SeriesProgram:
     early : operations that depend on t and q only; after them, the products in G v.
     late : operations that depend on v, too; after them, the products in G^T lam + M a.
     rows, row_indices : nonzero rows of G v + (C_t, b), and their indices. Terms "constant times v_i" are left out,
-        because only the matrix of the linear system of each order contains their coefficients.
+        because the linear system of each order has them on its left-hand side.
     balance, balance_indices : nonzero rows of Q - G^T lam - M a, without "constant times lam_i or a_i", and indices.
     traced : traces of the callbacks, for a comparison with calls; None: nothing is compared.
     """

@@ -198,11 +198,11 @@ RUN_ARRAYS.add_function("advance", i8(KIT, WORK, *(VECTOR,) * 9, MATRIX, MATRIX,
     LEAST_PIVOT,  # a start is refused if the smallest pivot of C_q at the start is below this
     EQUATION_FORM,  # initial f.form, the algebra that solves for accelerations
     FIRST_SIZE,  # first step size (s) chosen by the user; 0: `_first_step_size` computes it
-    LEAST_DISTANCE,  # argument `smallest` of _first_step_size, which replaces max|q| if max|q| is below it
+    LEAST_DISTANCE,  # argument `smallest` of _first_step_size, where max|q| counts as at least this
     LONGEST,  # longest step (s): argument `longest` of _set_step_limits
     EVALUATES_WITHIN,  # 1: the method adds evaluations within long steps; 0: it does not, which limits the step size
     NEAR_PIVOT,  # Python must check a run if, at an output time, (smallest / largest pivot of C_q) is below this
-    MAX_CHANGE_RATIO,  # v jumps in a step if max|change of v| > this * (step size) * min(max|a| at its two ends)
+    MAX_CHANGE_RATIO,  # v jumps in a step if max|change of v| > this * (step size) * (smaller max|a| of the two ends)
     MIN_SAMPLES,  # Python must check a run if two sudden changes of a force, C_t or b are closer than this many samples
 ) = range(18)
 # indices in `expected`, which lists the constraint rows that generated code uses (empty without generated code)

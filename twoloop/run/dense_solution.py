@@ -117,7 +117,7 @@ class Interpolator:
         from twoloop.kernels import advance
 
         system, t0, row = self.arguments[:3]
-        self.work.notes[indices.GENERATION] = 1.0  # as after a first partition: kernels must keep `self.ranks`
+        self.work.notes[indices.GENERATION] = 1.0  # number of partitions: unless it is 0, kernels keep `self.ranks`
         state = np.concatenate([row, np.zeros(system.n_c + system.n_a)])
         entry_point(advance.start)(self.kit, self.work, t0, state)
         self.repair_plans: dict[bool, tuple[Plan, Any]] = {}

@@ -127,7 +127,7 @@ class Run:
         self.starts_singular = False  # whether the start is a singular position: nearby, C_q has a higher rank
         self.branch_known = False  # whether it is known on which branch the motion leaves a singular start
         self.jumps: list[float] = []  # times (s) at which velocities jumped because C_t, or b in A v + b = 0, jumped
-        self.compared_until = [-np.inf]  # callbacks agreed with traces up to this time (s); copies share the list
+        self.compared_until = [-np.inf]  # callbacks and traces agree up to this time (s); a run's copies share the list
         self.region: CheckedRegion | None = None  # where callbacks agreed with traces; None: the system's region
         self.varied_parameters: Array | None = None  # current parameters in a ParametricRun; None in other runs
         self._compute_start_accelerations()
@@ -385,7 +385,7 @@ class Run:
         if self.fixed_order is None or set(rows) & set(independent_rows):
             return describe_dependence(self.system.rows(self.t0, q), rows)
         factors, zero, x = np.zeros((min(SHOWN, len(rows)), len(all_rows))), np.zeros(len(all_rows)), np.zeros_like(q)
-        for row, factor in zip(rows, factors, strict=False):  # fill `factor`: row = factor @ independent rows
+        for row, factor in zip(rows, factors, strict=False):  # write this row as factor @ (independent rows)
             entry_point(self.kit.inner)(self.kit, self.work, SOLVE, self.t0, all_rows.row(row), zero, 0.0, x, factor)
         return describe_equations(rows, independent_rows, factors[:, independent_rows], norms(all_rows))
 
@@ -399,7 +399,7 @@ class Run:
         self.control[self.a.SHORTEST] = cached_run().SHORTEST_STEP * first_size
 
     def limit_steps(self) -> None:
-        """Limit step sizes so that two evaluations of forces are at most 1 % of the run apart, to detect short forces.
+        """Limit steps so that successive force evaluations are at most 1 % of the run apart, to detect short forces.
 
         If forces may vary much within a step, one evaluation at a stage may not detect a short force: then the step
         size itself is at most 1 % of the run. Methods that add evaluations within long steps need no limit.

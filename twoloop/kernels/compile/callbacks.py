@@ -148,7 +148,7 @@ class CallbackKind:
 
     @property
     def optional(self) -> bool:
-        """Return True if systems may lack this callback; those whose size `needed_by` is not 0 must still have it."""
+        """Return True if systems may lack this callback, apart from those that need it according to `needed_by`."""
         return self.absent != ""
 
     @cached_property

@@ -209,7 +209,7 @@ _RULES: list[tuple[Any, str, Callable[..., Any]]] = [
     (event, "start_event", _skip_lock_events(event.start_event)),
     (event, "end_event", _skip_lock_events(event.end_event)),
 ]
-_MISSING_ATTRIBUTE = object()  # means that a class inherits the attribute: its replacement must be deleted later
+_MISSING_ATTRIBUTE = object()  # original value of an inherited attribute, whose replacement will simply be deleted
 _depth = [0]  # number of active contexts `kernel_rules`; only the outermost one replaces and restores functions
 
 

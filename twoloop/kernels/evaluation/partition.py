@@ -224,7 +224,7 @@ def write_programs(w):
 
 @compiled
 def _record_columns_of_entries(w):
-    """Store the columns of the ones in w.pattern, row by row, in w.row_entries; row i begins at index w.row_entries[i]."""
+    """Store the columns of ones in w.pattern, row by row, in w.row_entries; row i begins at index w.row_entries[i]."""
     n_rows = w.Rate.size
     index = n_rows + 1
     for i in range(n_rows):

@@ -213,7 +213,7 @@ def _choose_rows(f, w, t, q):
     if not _factor_entries(f, w, SUSPECT_PIVOT) > 0.0:
         return _failure_of_factorization(w, t, q)
     order, n_q = pivot_order_of(f.ldl_program), w.Q.size
-    copy(w.is_independent, w.z)  # w.z (scratch) marks rows with small pivots by 0; the loop checks these rows
+    copy(w.is_independent, w.z)  # w.z (scratch) marks rows with small pivots by 0; the loop below checks these rows
     for k in range(order.size):
         row = order[k] - n_q
         if row < 0 or w.z[row] != 0.0:
@@ -506,7 +506,7 @@ def _check_redundant_rows(f, w, t, q, v):
 
 @compiled
 def _do_task_between_evaluations(f, w, task, t, q, v, a, lam):
-    """Do one of the tasks FIND_NULL_SPACE to SOLVE in tasks.py; return a code: NEEDS_DENSE if it needs dense forms."""
+    """Do a task from FIND_NULL_SPACE to SOLVE (tasks.py); return a code, NEEDS_DENSE if the task needs a dense form."""
     if task == tasks.FIND_NULL_SPACE:
         return factor_equations_at(f, w, t, q)
     if task == tasks.RENEW_PARTITION:

@@ -58,7 +58,7 @@ LANES = 8 if has_wide_vectors() else 4  # number of runs at once: the number of 
     H_LIMIT,  # upper limit of step sizes (s), set by a failed step; infinity: no limit
     LIMIT_AGE,  # number of accepted steps since H_LIMIT was set
     JUMP_END,  # time (s) at the end of the last step that was rejected with an error above SUDDEN_ERROR
-    SHIFT,  # the times at which the defect within a step is evaluated are shifted in proportion to 2 SHIFT - 1
+    SHIFT,  # from 0 to 1; times at which the defect within a step is evaluated are shifted in proportion to 2 SHIFT - 1
     EVALUATED,  # number of evaluations within the step, in addition to settings[N_EVALUATIONS]
     DISPLACED,  # typical size of q (or v): finite differences displace smaller components as if they had this size
     LARGEST,  # largest |component| of the vector, q or v, that finite differences displace

@@ -82,7 +82,7 @@ def factor(program, is_independent, values, sizes, min_sine_square):
 
     The angle is between a row and the span of previous rows. Its squared sine is -pivot / (squared norm of the row).
     The squared norms are stored in `sizes`, 1 / pivot in the diagonal of the factors. Rows with is_independent = 0 on
-    entry are redundant. Rows with a squared sine of at most `min_sine_square` are redundant, too, and get the value 0.
+    entry are redundant. For rows with a squared sine of at most `min_sine_square`, is_independent becomes 0, too.
     Factors of redundant rows are 0. If the pivot of a coordinate is not positive (M not definite), return NOT_DEFINITE.
     """
     (n_q, n) = program[N_COORDINATES], program[N_PIVOTS]
