@@ -226,9 +226,9 @@ def _sum_of_products(
 
 
 def _normalized_product(factor: Affine, multiplier: Affine) -> tuple[Any, float, Affine, Affine]:
-    """Return (key, scale, first, second) with factor * multiplier = scale * first * second; scale is a number.
+    """Return (key, scale, first, second): factor * multiplier = scale * first * second; `key` identifies first * second.
 
-    Products that differ only by `scale` have equal keys, so that one operation computes them.
+    Products that differ only by the number `scale` have equal keys, so that one operation computes them.
     """
     scale, multiplier = multiplier.normalized()
     return (factor.key, multiplier.key), scale, factor, multiplier

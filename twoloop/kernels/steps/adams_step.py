@@ -45,8 +45,8 @@ def _error_constants():
     return np.abs(coefficients)
 
 
-# error constants of equal steps. A step's error estimate uses the larger one of this constant and that for the actual
-# step sizes: after a decrease of the step size, the latter is so small that errors where forces jump would be missed
+# error constants of equal steps. They replace smaller constants for the actual step sizes: after a decrease of the step
+# size, error estimates with smaller constants would miss jumps of forces
 ERROR_CONSTANTS = _error_constants()
 
 THETA, N_OPTIONS = range(2)  # THETA: index in `options` of the tolerance of projections, see `project`
