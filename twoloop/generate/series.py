@@ -226,7 +226,7 @@ def _sum_of_products(
 
 
 def _normalized_product(factor: Affine, multiplier: Affine) -> tuple[Any, float, Affine, Affine]:
-    """Return (key, scale, first, second): factor * multiplier = scale * first * second; `key` identifies first * second.
+    """Return (key, scale, first, second): factor * multiplier = scale * first * second; `key` is for first * second.
 
     Products that differ only by the number `scale` have equal keys, so that one operation computes them.
     """
