@@ -133,9 +133,9 @@ FIRST_DEGREE = 3.0  # degree of the polynomial that predicts the accelerations i
 KAPPA = 0.02  # sweeps end if the estimated error of the iteration, relative to the tolerances, is at most this
 TARGET_SWEEPS = 6.0  # number of sweeps (iterations) in which a step should converge: the step size is chosen for this
 EXTRA_SWEEPS = 7  # a step is rejected if it has not converged after the target number of sweeps and this number more
-MAX_CONTRACTION = 0.8  # from sweep 4 on, reject the step if change of v / change by the sweep before is at least this
+MAX_CONTRACTION = 0.8  # from sweep 4 on, reject the step if |change of v| / |previous sweep's change| is at least this
 MIN_RHO, MAX_RHO = 1e-3, 0.9  # the ratio rho of changes of v by successive sweeps is clipped to these bounds
-FAST_START, SLOW_START = 0.04, 0.3  # keep a guessed step size if change of v by sweep 2 / by sweep 1 is in this range
+FAST_START, SLOW_START = 0.04, 0.3  # keep guessed step sizes if |change of v by sweep 2 / by sweep 1| is between these
 STAGNATION_RATIO = 0.5  # sweeps also end if the change of v is of rounding size and at least this * the previous change
 # with steps of fixed size, sweeps (iterations) end if the error of the iteration is at most KAPPA_OF_FIXED * tolerance,
 # if changes of velocities v are below ROUNDING_OF_FIXED * |v| and do not decay, or after MAX_SWEEPS_OF_FIXED sweeps
@@ -271,7 +271,7 @@ class CollocationCode:
     def _evaluator(
         self, emit: LaneEmitter, work: Value, state: Value, index: int
     ) -> Callable[[list[Value]], Callable[[], Value]]:
-        """Return the argument `evaluate` of `_iterate`: it writes calls of the program `accelerations[index]`."""
+        """Return a function that writes calls of the program `accelerations[index]`: `evaluate` for `_iterate`."""
         accelerations = Emitter(emit.builder).pointer(work, self.a_offset)
 
         def evaluate(inputs: list[Value]) -> Callable[[], Value]:
@@ -467,7 +467,7 @@ class CollocationCode:
             v0, a0 = (num.load(num.pointer(state, i), m * self.n) for m in (1, 2))
             of_v = self._weighted_accelerations(emit, tables().velocities, a0, work, i)
             store_lanes(emit, emit.fma(h, of_v, emit.broadcast(v0)), num.pointer(work, k * LANES), self.spectrum_offset)
-        offset.add_incoming(integer(self.spectrum_offset), builder.block)  # velocities for the second run of the block
+        offset.add_incoming(integer(self.spectrum_offset), builder.block)  # offset of v when the loop's code runs again
         builder.jump(loop)
         builder.position_at_end(after)
 
@@ -523,10 +523,10 @@ class CollocationCode:
         num.store(builder.extract(factors, 1), work, mem.FACTOR_OF_ERROR)
 
     def find_defect(self, emit: LaneEmitter, work: Value, state: Value, numbers: Value) -> Value:
-        """Write code for the largest |deviation of accelerations from the equations| / limit, halfway between nodes.
+        """Write code for the defect: the largest |deviation from the equations| / its limit, halfway between nodes.
 
-        Return this ratio; INVALID if pivots are too small or accelerations are not finite. The limit is ALLOWED_DEFECT
-        * (tolerance of the velocity) / h, h: step size. The code stores FACTOR_OF_DEFECT: largest allowed (next h) / h.
+        Return the defect, or INVALID if pivots are too small or accelerations are not finite. The limit (h: step size)
+        is ALLOWED_DEFECT * (velocity tolerance) / h. The code stores FACTOR_OF_DEFECT: largest allowed (next h) / h.
         """
         builder, num, n = emit.builder, Emitter(emit.builder), self.n
         emit.numbers = emit.constants = numbers

@@ -197,7 +197,7 @@ class Quantities:
     def __init__(self, emit: Emitter, load: Callable[[int], Value]):
         self._emit, self._load = emit, load
         self._values: dict[int, Value] = {}
-        self._loaded: dict[int, Value] = {}  # values loaded in the current part of the function
+        self._loaded: dict[int, Value] = {}  # by index: quantities that this part of a split function has loaded
         self._part = emit.builder.part
         self._sums: dict[tuple[Terms, float], Value] = {}
 
@@ -206,7 +206,7 @@ class Quantities:
         self._values[quantity] = value
 
     def value(self, quantity: int) -> Value:
-        """Return the value that `define` has set for a quantity, or else load it, once in each part of the function."""
+        """Return the value set by `define` for a quantity, or else load it, once in each part of a split function."""
         if quantity in self._values:
             return self._values[quantity]
         loaded = self._loaded_in_part()
@@ -219,7 +219,7 @@ class Quantities:
         self._loaded_in_part()[quantity] = self._values.pop(quantity)
 
     def _loaded_in_part(self) -> dict[int, Value]:
-        """Return a dict {quantity: value} of the values that the current part of the function has loaded so far."""
+        """Return a dict {quantity: value} of the values that this part of a split function has loaded so far."""
         if self._part != self._emit.builder.part:
             self._part, self._loaded = self._emit.builder.part, {}
         return self._loaded
@@ -415,6 +415,6 @@ class Lowering(Algebra[Value]):
 def lower_program(
     emit: Emitter, program: Program, inputs: Sequence[Value], numbers: Coefficients
 ) -> tuple[Lowering, list[list[Value]]]:
-    """Write code that evaluates a program at `inputs`; return the Lowering used, and the values of the arrays."""
+    """Write code that evaluates a program at `inputs`; return the Lowering, and the values of the program's arrays."""
     lowering = Lowering(emit, numbers)
     return lowering, program.run(lowering, inputs)

@@ -31,7 +31,7 @@ class Block(NamedTuple):
 
     row_indices: tuple[int, ...]
     inverse: list[list[Affine]]  # inverse of the pivot block, a 1x1 or 2x2 block of the matrix D
-    rows_below: list[tuple[int, list[Affine]]]  # index and entries of each nonzero row of L below the block
+    rows_below: list[tuple[int, list[Affine]]]  # index and entries of each nonzero row of L below this block
 
 
 class Factors:
@@ -73,7 +73,7 @@ class Factors:
     def _inverse(self, pivots: list[list[Affine]], own_pivots: list[Any]) -> list[list[Affine]]:
         """Return the inverse of a 1x1 or 2x2 pivot block, and append its pivots to `mass_pivots` or `conditions`.
 
-        `own_pivots`: None for rows whose pivot goes to `mass_pivots`; otherwise the row's pivot if G had no other row.
+        `own_pivots`: a row's pivot as it would be without other rows of G; None if the pivot goes to `mass_pivots`.
         """
         diagonal = [None if pivot is None else pivot.as_term() for pivot in own_pivots]
         a = pivots[0][0]
@@ -156,7 +156,7 @@ def _order_rows(rows: list[dict[int, Affine]], n: int, pairs: Sequence[tuple[int
 
     The row with the fewest neighbours comes first (minimum degree); neighbours of a row are the columns of its nonzero
     entries. Two rows with the same neighbours form one tuple. A row of G (index `n` and later) is eliminated after the
-    coordinates in which it has nonzero entries. In a tie, the row that needs the fewest successive divisions is first.
+    coordinates in which it has nonzero entries. In a tie, the row after the shortest chain of divisions is first.
     """
     neighbours = [set(row) - {i} for i, row in enumerate(rows)]
     waiting_for = [{j for j in neighbours[i] if j < n} if i >= n else set() for i in range(len(rows))]
@@ -191,8 +191,8 @@ def _eliminate(neighbours: list[set[int]], rows: Sequence[int]) -> set[int]:
 PivotBlocks = Sequence[tuple[tuple[int, ...], tuple[int, ...]]]  # per block: indices of its one or two rows and columns
 Terms = dict[int, Affine]  # nonzero entries of a row of a matrix; keys: column indices
 
-# accelerations are invalid if the square of one of these ratios is below this limit: a pivot / the norm of the entries
-# that it divides; a pivot / the norm of its column; the sine of the angle between the columns of a 2x2 block. A ratio
+# accelerations are invalid if the square of one of three ratios is below this limit: pivot / (norm of the entries that
+# it divides), pivot / (norm of its column), or the sine of the angle between the columns of a 2x2 block. A ratio
 # of 10^-k costs up to 3 k digits. The choice of pivots before a run (linalg/dependent_columns.py) is stricter
 MIN_PIVOT_SQUARE = 0.03**2
 
@@ -376,9 +376,9 @@ def solve_refined(
     `solve`: function that solves linear systems with the matrix [M + S, G^T; G 0], where S is 0, or terms that make
     M definite (see PivotChoice).
 
-    If `choice.is_refined`, a step of refinement improves the solution. Then there is one condition, otherwise none: a
-    pair of expressions. If the first is not larger than the second, refinement has changed a too much, compared with a
-    and (as a is small near equilibrium) with the accelerations that the forces r would cause without constraints.
+    If `choice.is_refined`, a step of refinement improves the solution, and there is one condition, otherwise none. The
+    condition is a pair of expressions; the first must be larger than the second. Otherwise the change of a is too large
+    compared with a and with the accelerations due to r without constraints (which count, as a may be almost zero).
     """
 
     def solve_once(r: Sequence[Affine], c: Mapping[int, Affine] | Sequence[Affine]) -> list[Affine]:

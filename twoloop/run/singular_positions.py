@@ -151,7 +151,7 @@ def _crossing_ends(crossings: Crossings, end_state: TimedState) -> Iterator[tupl
 
 
 def _largest_acceleration(system: ConstrainedSystem, t: float, q: Array, v: Array, min_ratio: float) -> float:
-    """Return max|a_j|; singular values of the Jacobian below `min_ratio` times the largest one count as zero."""
+    """Return max|acceleration|; singular values of the Jacobian below `min_ratio` times the largest count as zero."""
     mass, rows, norms, units = scaled_to_unit_masses(system, t, q)
     left, values, right = np.linalg.svd(rows, full_matrices=False)
     is_kept = values > min_ratio * values[0]
@@ -164,7 +164,7 @@ def _largest_acceleration(system: ConstrainedSystem, t: float, q: Array, v: Arra
 
 
 def scaled_to_unit_masses(system: ConstrainedSystem, t: float, q: Array) -> tuple[Array, Array, Array, Array]:
-    """Return M and the constraint Jacobian, both scaled, the divisors of rows, and the units of coordinates.
+    """Return the scaled M, the scaled constraint Jacobian, the divisors of its rows, and the units of coordinates.
 
     q_j is scaled as q_j / unit_j with unit_j = 1 / sqrt(M_jj), so that the diagonal entries of M become 1. After
     division by the divisors, rows of the Jacobian have the norm 1, unless they are small only at this position.

@@ -172,11 +172,11 @@ EQUAL_CHANGES = 1e-5  # two changes are the same if their times differ by at mos
 MIN_RECORDED_TIME = 5e-5
 MIN_STEEPNESS_RATIO = 2.0  # a sudden change between two samples exceeds the changes before and after it by this factor
 SHORT_STEP = 0.5  # steps below this fraction of the longest recent step are searched for pulses of forces, C_t and b
-N_SAMPLES_IN_SHORT_STEP = 4  # number of samples within a short step, in search of pulses
+N_SAMPLES_IN_SHORT_STEP = 4  # number of samples within a short step that is searched for pulses of forces, C_t and b
 # if a change of velocities by at most their tolerances changes an acceleration by more than this fraction of the
 # largest one, motion is not extrapolated with the present accelerations, see `_acceleration_lasts`
 MAX_LASTING_CHANGE = 0.5
-CHANGE_MARGIN = 0.01  # a step ignores a change within this fraction of the time between samples after the step's start
+CHANGE_MARGIN = 0.01  # a step ignores changes just after its start: within this fraction of the time between samples
 # w.changes has a column for each force, C_t and b; rows 0 to N_SAMPLES contain samples at successive times
 LARGEST_ROW = N_SAMPLES + 1  # row of w.changes: largest |value| of each force, C_t and b so far
 MIDDLE_ROW = N_SAMPLES + 2  # row of w.changes: a sample at a time between two of the 21 samples, or before them
@@ -240,7 +240,7 @@ def _first_sudden_bend(values, n, detrends, min_range):
     subtracts the straight line from the first to the last searched sample if `detrends` is 1, nothing if it is 0.
     """
     index, limit = _find_sudden_bend(values, n, detrends * (values[n] - values[0]) / max(n, 1), min_range, False)
-    while index > 1:  # `strict` is True, because bends of a smooth curve, too, may exceed the limit if samples are few
+    while index > 1:  # find earlier bends; skip smooth curves (`strict`), which may exceed the limit if samples are few
         slope = detrends * (values[index] - values[0]) / index
         earlier, bound = _find_sudden_bend(values, index, slope, min_range, True)
         if earlier == 0:
@@ -251,9 +251,9 @@ def _first_sudden_bend(values, n, detrends, min_range):
 
 @compiled
 def _is_sudden_change(previous, first_value, second_value, following, limit):
-    """Return True if the change from `first_value` to `second_value` exceeds `limit` and the changes next to it.
+    """Return True if |second_value - first_value| exceeds `limit` and is much larger than both neighbouring changes.
 
-    A change next to it (from `previous`, or to `following`) counts MIN_STEEPNESS_RATIO times, or not if signs differ.
+    Only neighbouring changes of the same sign count: each must be more than MIN_STEEPNESS_RATIO times smaller.
     """
     change = second_value - first_value
     sign = 1.0 if change > 0.0 else -1.0
@@ -371,8 +371,8 @@ def _record_short_change(f, w, tolerances, control, clock, t, size, last, q, v, 
 def _acceleration_lasts(f, w, tolerances, t, duration, q, v, a, Q, V, A):
     """Return True if the motion may be extrapolated over `duration` (s) with constant accelerations, the argument `a`.
 
-    Accelerations must hardly change if velocities change by `a` * `duration` or, if less, by their tolerances. If stiff
-    friction holds a body, `a` consists of rounding errors of balanced forces: return False. (Q, V, A) is scratch.
+    Accelerations must hardly change if velocities change by `a` * `duration`, reduced until no change exceeds its
+    tolerance. If stiff friction holds a body, `a` is a rounding error of its forces: return False. Q, V, A: scratch.
     """
     n, time, largest, change = w.Q.size, duration, 0.0, 0.0
     for m in range(n):
@@ -434,7 +434,7 @@ def _sample_ahead(f, w, tolerances, control, clock, next_change, t, size, last, 
     if may_resample and max_spacing < RESAMPLE_BELOW * clock[at.SAMPLED_EVERY]:
         clock[at.SAMPLED_TO] = t
     begin = max(t, clock[at.SAMPLED_TO])
-    is_at_change = clock[at.DISCONTINUITY] == clock[at.SAMPLED_TO]  # True: samples may be no farther apart than before
+    is_at_change = clock[at.DISCONTINUITY] == clock[at.SAMPLED_TO]  # if so, the spacing of samples must not increase
     while begin < min(t + size, last, next_change):
         spacing, is_at_change = min(max_spacing, clock[at.SAMPLED_EVERY]) if is_at_change else max_spacing, False
         clock[at.WIDEST_SAMPLING] = max(clock[at.WIDEST_SAMPLING], spacing)

@@ -97,7 +97,7 @@ H, ERRORS, FAILURES, PARTITIONS, JACOBIANS, N_STEP_COLUMNS = range(6)
     DISCONTINUITY,  # time (s) of the next sudden change of a force, C_t or b at a fixed state; infinite: none is known
     DISCONTINUITY_OF_MOTION,  # time (s) of the next sudden change of a force, C_t or b in the motion; infinite: unknown
     COMPARED,  # start time (s) of the last short step that was searched for pulses of a force
-    LAST_CHANGE,  # time (s) of the last sudden change of a force, C_t or b; -infinite: none
+    LAST_CHANGE,  # time (s) of the last sudden change of a force, C_t or b; -inf: none
     SHORTEST_CHANGE,  # shortest time (s) from one sudden change of a force, C_t or b to the next; infinite: unknown
     MOTION_SAMPLED_TO,  # time (s) of the last sample along the motion
     SAMPLES_MOTION,  # 1 while callbacks are called at predicted states, where exceptions do not end a run; otherwise 0

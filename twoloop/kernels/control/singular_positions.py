@@ -40,8 +40,8 @@ MIN_END_RATIO = 0.25  # `ends_near_singular` is True only if the smallest pivot 
 def is_near_singular(f, w, control, clock, t, q):
     """Return True if a singular position is near the accepted position q at time t, and control[MAY_CROSS] is 1.
 
-    A position is near if the smallest pivot of C_q is small, or if no partition can be chosen. Compute this pivot for a
-    new partition if its last value, w.pivot, is small, or may be old because generated code took the last steps.
+    A singular position is near if the smallest pivot of C_q is small, or if no partition can be chosen. Compute this
+    pivot for a new partition if its last value, w.pivot, is small or may be old, as generated code took the last steps.
     """
     if control[at.MAY_CROSS] != 1.0:
         return False
@@ -183,7 +183,7 @@ def check_partition(f, w, control, clock, size, at_output, state):
         find_tangents(f, w, clock[at.T], state[:n])
     if is_checked and partition_is_poor(w) and renew_partition(f, w, clock[at.T], state[:n]) != DONE:
         return at.RANK_LOST
-    # near_now = 2: steps of generated code, which do not update w.pivot, request its value at this state
+    # w.near_now is 2 if a step of generated code, which does not update w.pivot, requests this pivot
     if f.is_generated == 1 and w.near_now == 2.0 and renew_partition(f, w, clock[at.T], state[:n]) != DONE:
         return at.RANK_LOST
     clock[at.LARGEST_PIVOT] = max(clock[at.LARGEST_PIVOT], w.pivot)

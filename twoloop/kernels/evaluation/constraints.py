@@ -94,7 +94,7 @@ ONE_SIDED_WEIGHTS, ONE_SIDED_WEIGHTS_COARSE = (-1.5, 2.0, -0.5, 0.0), (-0.75, 0.
 ONE_SIDED_STEP_RATIO = 1.0 / 16.0  # ratio of the time step of one-sided differences to that of central differences
 # assumed rounding error of Gamma, divided by (largest |term G_ij v_j| / largest time step); G: constraint Jacobian
 ROUNDING_OF_TERMS = 1e-14
-CONVERGED_CHANGE = 0.01  # the search for a time step ends if Gamma changes by at most this part of its allowed error
+CONVERGED_CHANGE = 0.01  # time steps are divided until Gamma changes by at most this part of its allowed error
 
 
 @exact
@@ -171,7 +171,7 @@ def _fill_gamma(f, w, t, q, v, e, first, last):
 
 @merged
 def _max_disagreement(w):
-    """Return the allowed difference between Gamma with the time steps e and 2 e; it exceeds the error of Gamma."""
+    """Return the largest allowed |Gamma for the time step e - Gamma for 2 e|; the error of Gamma is smaller."""
     return max(w.gamma_required, ROUNDING_DISAGREEMENT) * w.gamma_scale
 
 
@@ -221,7 +221,7 @@ def gamma_by_differences(f, w, t, q, v, first, last):
     if e > 0.0:
         largest, disagreement, terms = _fill_gamma(f, w, t, q, v, e, first, last)
         if np.isnan(largest) or disagreement == 0.0 or w.gamma_scale == 0.0:
-            return DONE  # accept NaN (the caller reports it), a zero error, and any error while w.gamma_scale is 0
+            return DONE  # accept NaN (the caller reports it), a zero error, and any error before w.gamma_scale is known
         rounding = ROUNDING_OF_TERMS * terms / largest_step
         w.gamma_scale = max(w.gamma_scale, largest, rounding / w.gamma_required)
         if disagreement < NEGLIGIBLE_DISAGREEMENT * w.gamma_scale:

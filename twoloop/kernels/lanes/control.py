@@ -210,7 +210,7 @@ def memory_size(s: int, n: int) -> int:
 def step_by_dop853(code, settings, control, options, work, status, n_steps, within):
     """Take a step of DOP853 in each lane, at most as long as control[GAP] (s).
 
-    If `within`, take no step: compute the states at the time X (s) after the beginning of the last accepted step.
+    If `within`, take no step: compute the states X seconds after the beginning of the last accepted step.
     """
     n = settings[at.N]
     state, _, _, _, a, _, _, memory = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])
@@ -231,7 +231,7 @@ def step_by_dop853(code, settings, control, options, work, status, n_steps, with
 def step_by_series(code, settings, control, options, work, status, n_steps, within):
     """Take a step in each lane, by the Taylor series about the beginning of the step.
 
-    If `within`, take no step: compute the states at the time X (s) after the beginning of the last accepted step.
+    If `within`, take no step: compute the states X seconds after the beginning of the last accepted step.
     """
     order = settings[at.ORDER]
     if within:
@@ -245,7 +245,7 @@ def step_by_series(code, settings, control, options, work, status, n_steps, with
     code.compute_series(order, control, work)
     code.choose_sizes(order, control, work)
     _round_steps(work, control)
-    for k in range(LANES):  # X is step size / UNIT; EVALUATED counts evaluations within a step longer than GAP (s)
+    for k in range(LANES):  # X is step size / UNIT. Steps longer than GAP (s) require EVALUATED evaluations within them
         work[at.X * LANES + k] = work[at.H * LANES + k] / work[at.UNIT * LANES + k]
         if work[at.ACTIVE * LANES + k] == 1.0 and work[at.H * LANES + k] > control[at.GAP]:
             work[at.EVALUATED * LANES + k] = np.ceil(work[at.H * LANES + k] / control[at.GAP]) - 1.0

@@ -98,7 +98,7 @@ def vector_offset(memory, n, block):
 
 @merged
 def block_offset(memory, n, s, block):
-    """Return the offset of a block of (s, n) vectors, such as STAGES; `memory`: offset of the method's memory."""
+    """Return the offset of a block of s n vectors, such as STAGES; `memory`: offset of the method's memory."""
     return memory + N_SINGLE_VECTORS + (N_VECTORS + block * s) * n
 
 
@@ -335,7 +335,7 @@ def _raise_to_largest_value(work, target, begin, n):
 
 @compiled
 def _store_largest_corrections(settings, A, A2, work):
-    """Store in LARGEST_Q, LARGEST_V the largest changes of q / X^2, v / X by the corrections CHANGES (X: step size)."""
+    """From CHANGES, store max|change of q| / X^2 in LARGEST_Q, max|change of v| / X in LARGEST_V (X: step size)."""
     n = settings[at.N]
     memory = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])[7]
     s = A.shape[0]
@@ -406,7 +406,7 @@ def solve_stages(code, settings, control, options, method_options, A, A2, c, wor
 
 @compiled
 def store_state_from_stages(settings, b, bA, work):
-    """Store in NEW the state X (s) after the step begins: STAGES are summed with weights b for v, bA = b A for q."""
+    """Store in NEW the state X seconds after the step's start: sum STAGES with the weights b for v, bA = b A for q."""
     n = settings[at.N]
     _, new, _, _, _, _, _, memory = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])
     s = b.size
@@ -607,7 +607,7 @@ def _store_stages(work, memory, n, s):
 def step_by_newton(code, settings, control, options, work, status, n_steps, within):
     """Take a step of an implicit Runge-Kutta method in each lane, at most as long as control[GAP] (s).
 
-    If `within`, take no step: compute the states at the time X (s) after the beginning of the last accepted step.
+    If `within`, take no step: compute the states X seconds after the beginning of the last accepted step.
     """
     n = settings[at.N]
     state, _, _, _, a, _, _, memory = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])

@@ -51,7 +51,7 @@ def select_rows(G, min_sine, basis, factors, kept):
     A row is selected if the sine of its angle to the span of the rows selected before exceeds `min_sine`. This angle is
     found by Gram-Schmidt orthogonalisation, which is repeated if the orthogonal part of the row is small. On return,
     the rows of `basis` are orthonormal, and the matrix of selected rows is the lower triangle `factors` times `basis`.
-    Both arrays have one more row than G can have independent rows; this last row is scratch.
+    If G can have n independent rows, both arrays need n + 1 rows; the last one is scratch.
     """
     n_kept = 0
     for k in range(len(G)):
@@ -160,7 +160,7 @@ SIMILAR_EIGENVALUES, INDEPENDENT, DEPENDENT = 1e-7, 1e-10, 1e-10
 # become dependent, for example at dead centres. Coefficients of 1, which are common, must not cause exchanges
 MAX_COEFFICIENT = 1.5
 TIE_RATIO = 1.01  # coefficients count as equal up to this ratio, so that rounding errors do not choose among them
-ZERO_ENTRY = 1e-12  # entries up to this fraction of the largest in their row count as zero: they may be rounding errors
+ZERO_ENTRY = 1e-12  # an entry up to this fraction of its row's largest entry counts as zero: it may be a rounding error
 
 
 def workspace_size(n_rows: int, n: int) -> int:
@@ -201,7 +201,7 @@ def _eigenvalue_bounds(mass):
 
 @compiled
 def _count_weak_eigenvalues(mass, weak_ratio, A):
-    """Count eigenvalues of M = `mass` up to z = weak_ratio * (bound of the largest); store factors of M - z I in A."""
+    """Count eigenvalues of M = `mass` up to a limit, weak_ratio * (upper bound); store factors of M - limit I in A."""
     _, largest = _eigenvalue_bounds(mass)
     copy_matrix(mass, A)
     for i in range(len(mass)):
@@ -416,7 +416,7 @@ def _first_bound_below_pivots(S, kept, n_kept, largest_inverse, bounds, scratch)
 
 @merged
 def _mark_independent_rows(G, min_sine, basis, factors, coefficients, C, kept, is_kept):
-    """Set `is_kept` to 1 for the rows of G that `select_rows` selects, else to 0: these are redundant.
+    """Set `is_kept` to 1 for the rows of G that `select_rows` selects, and to 0 for the others, the redundant rows.
 
     C[i, k] becomes the coefficient of independent row k in redundant row i, both scaled to norm 1. The arrays
     `basis`, `factors`, `coefficients` and `kept` are scratch.
@@ -438,10 +438,10 @@ def _mark_independent_rows(G, min_sine, basis, factors, coefficients, C, kept, i
 def choose_rows(original_mass, G, min_sine, weak_ratio, bounds, workspace, chosen):
     """Choose independent rows of G, and rows g that make M = `original_mass` invertible if s g^T g is added (s > 0).
 
-    Rows of G are selected by limits (see INDEPENDENT) or by `select_rows`, then exchanged by `_exchange_rows`. Rows g
-    are chosen if weak_ratio > 0 and M has eigenvalues below `weak_ratio` times the largest. Return the index of the
-    first of `bounds` that is below all pivots of G M^-1 G^T, scaled to a diagonal of 1; bounds.size if there is none;
-    on failure, STAYS_SINGULAR or NOT_DEFINITE. Other results (n_rows: number of rows of G):
+    Rows of G are selected by their pivots (see INDEPENDENT) or by `select_rows`, then exchanged by `_exchange_rows`.
+    Rows g are chosen if weak_ratio > 0 and M has eigenvalues below `weak_ratio` times the largest. Return the index of
+    the first of `bounds` that is below all pivots of G M^-1 G^T, scaled to a diagonal of 1; bounds.size if there is
+    none; on failure, STAYS_SINGULAR or NOT_DEFINITE. Other results (n_rows: number of rows of G):
 
     - chosen[0], chosen[1]: number of independent rows, number of rows g. Two lists of length n_rows follow: the indices
       of independent rows, and of rows g. The remaining n_rows numbers are scratch

@@ -222,7 +222,7 @@ def stages_at_once(options):
 
 @compiled
 def _update_derivatives(f, w, options, tolerances, memory, t, h, Q, V, F):
-    """If Newton's Jacobian or its factors are outdated, renew them at (t, Q, V; accelerations F); return a code."""
+    """If Newton's Jacobian or its factors are outdated, renew them at (t, Q, V), accelerations F; return a code."""
     if f.force_by_q_given == 1 or memory[at.HAS_JACOBIAN] == 0.0:
         multipliers(f, w, t, Q, V, F, w.lam)
         memory[at.HAS_JACOBIAN] = 1.0
@@ -374,7 +374,7 @@ def _renew_derivatives(f, w, options, tolerances, memory, t, h, new_state):
 
 @compiled
 def _estimate(f, w, options, memory, t, h, tolerances, state, new_state, V_stage, A_stage, weights, factor):
-    """Estimate the error of a step by sums of its stages times `weights`; return its largest component in tolerances.
+    """Estimate the error of a step by sums of stages times `weights`; return the largest component in tolerances.
 
     Stiff components do not count, because the estimate is filtered (Hosea and Shampine 1996). If derivatives are so old
     that the filter is wrong, they are computed anew. At the end, E_Q and E_V contain the estimate filtered twice.

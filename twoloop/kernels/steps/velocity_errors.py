@@ -1,4 +1,4 @@
-"""Estimate the position errors that velocity errors cause, for methods whose steps are longer than vibrations.
+"""Estimate the position errors that velocity errors cause, if a method's steps are longer than vibration periods.
 
 A velocity error e changes the positions until e changes its sign or decays. This takes about sqrt(|e| / |J J e|), the
 duration of e. J is the Jacobian of the equations of motion (q, v)' = (v, F), where F are the accelerations. So an error
@@ -59,7 +59,7 @@ def filtered_velocity_error(w, memory, tolerances, z, unfiltered, filtered_once,
 
 @compiled
 def velocity_error(w, tolerances, e_v, duration, state, new_state):
-    """Return the largest effect, in units of the tolerances, of a velocity error e_v (n_dof) that lasts `duration` (s).
+    """Return the largest effect on a coordinate, in tolerances, of a velocity error e_v (n_dof) lasting `duration` (s).
 
     The effect on a coordinate is the smaller one of two ratios: the velocity error to the velocity tolerance; and the
     position error, |e_v| times `duration`, to the position tolerance.
