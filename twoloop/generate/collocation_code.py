@@ -271,7 +271,7 @@ class CollocationCode:
     def _evaluator(
         self, emit: LaneEmitter, work: Value, state: Value, index: int
     ) -> Callable[[list[Value]], Callable[[], Value]]:
-        """Return a function that writes calls of the program `accelerations[index]`: `evaluate` for `_iterate`."""
+        """Return a function `evaluate` for `_iterate`; it writes calls of the program `accelerations[index]`."""
         accelerations = Emitter(emit.builder).pointer(work, self.a_offset)
 
         def evaluate(inputs: list[Value]) -> Callable[[], Value]:

@@ -155,8 +155,8 @@ def _order_rows(rows: list[dict[int, Affine]], n: int, pairs: Sequence[tuple[int
     """Return the order of elimination of the rows that are not in `pairs`, as tuples of one or two row indices.
 
     The row with the fewest neighbours comes first (minimum degree); neighbours of a row are the columns of its nonzero
-    entries. Two rows with the same neighbours form one tuple. A row of G (index `n` and later) is eliminated after the
-    coordinates in which it has nonzero entries. In a tie, the row after the shortest chain of divisions is first.
+    entries. Two rows with the same neighbours form one tuple. A row of G (index `n` and later) follows the coordinates
+    in which it has nonzero entries. In a tie, the row whose pivot depends on the fewest successive divisions is first.
     """
     neighbours = [set(row) - {i} for i, row in enumerate(rows)]
     waiting_for = [{j for j in neighbours[i] if j < n} if i >= n else set() for i in range(len(rows))]
@@ -377,8 +377,8 @@ def solve_refined(
     M definite (see PivotChoice).
 
     If `choice.is_refined`, a step of refinement improves the solution, and there is one condition, otherwise none. The
-    condition is a pair of expressions; the first must be larger than the second. Otherwise the change of a is too large
-    compared with a and with the accelerations due to r without constraints (which count, as a may be almost zero).
+    condition is a pair of expressions; the first must be larger than the second. Otherwise the change by refinement is
+    too large, compared with a and (as a is small near equilibrium) with accelerations due to r without constraints.
     """
 
     def solve_once(r: Sequence[Affine], c: Mapping[int, Affine] | Sequence[Affine]) -> list[Affine]:
