@@ -201,7 +201,7 @@ def _eigenvalue_bounds(mass):
 
 @compiled
 def _count_weak_eigenvalues(mass, weak_ratio, A):
-    """Count eigenvalues of M = `mass` up to a limit, weak_ratio * (upper bound of all), and store M - limit I, factored, in A."""
+    """Count eigenvalues of M = `mass` up to limit = weak_ratio * (bound of the largest); factor M - limit I in A."""
     _, largest = _eigenvalue_bounds(mass)
     copy_matrix(mass, A)
     for i in range(len(mass)):
