@@ -31,7 +31,7 @@ class Block(NamedTuple):
 
     row_indices: tuple[int, ...]
     inverse: list[list[Affine]]  # inverse of the pivot block, a 1x1 or 2x2 block of the matrix D
-    rows_below: list[tuple[int, list[Affine]]]  # index and entries of each nonzero row of L below this block
+    rows_below: list[tuple[int, list[Affine]]]  # index and entries of each nonzero row of the factor L below this block
 
 
 class Factors:
