@@ -56,9 +56,9 @@ MIN_PIVOTS = 10.0 ** np.arange(-2, -9, -1)  # possible PivotChoice.min_pivot; be
 # for the first i with START_LIMITS[i] <= p, or MIN_PIVOTS[-1] if there is no such i
 START_LIMITS = MIN_PIVOTS[:-1] / PIVOT_FRACTION
 # M + s G^T G (s: scales of rows) is tried in place of M if PivotChoice.min_pivot would be MIN_PIVOTS[i] with i >= m.
-# With at most N_FEW_COORDINATES coordinates, m is MIN_INDEX_FEW or, if M is singular, MIN_INDEX_FEW_SINGULAR: then even
-# sound models (with Euler parameters) lose two digits. With more coordinates, M + s G^T G makes the code much longer.
-# Then m is MIN_INDEX_MANY or, if M is singular, MIN_INDEX_MANY + 1
+# With at most N_FEW_COORDINATES coordinates, m is MIN_INDEX_FEW or, if M is singular, MIN_INDEX_FEW_SINGULAR, because a
+# singular M (Euler parameters) costs two digits even in sound models. With more coordinates, M + s G^T G makes the code
+# much longer. Then m is MIN_INDEX_MANY or, if M is singular, MIN_INDEX_MANY + 1
 N_FEW_COORDINATES = 24
 MIN_INDEX_FEW, MIN_INDEX_FEW_SINGULAR, MIN_INDEX_MANY = 4, 5, 6
 ADDED_SIZE = 16.0  # scales s are chosen so that the largest entry of s G^T G is about this * the largest entry of M
@@ -113,8 +113,8 @@ class DependentColumns:
     """Chooser of the dependent coordinates, which the independent rows of G determine from the other coordinates.
 
     rows : indices of the independent rows of G.
-    choose (field) : compiled function choose(G, *arguments), which stores pivot blocks and returns their number. None:
-        no elimination if `rows` are fewer than MIN_ROW_RATIO * n_q, or if constant entries of G are unknown.
+    choose (field) : compiled function choose(G, *arguments), which stores pivot blocks and returns their number. It
+        is None if `rows` are fewer than MIN_ROW_RATIO * n_q, or if it is unknown which entries of G are constant.
     """
 
     choose: Any = None
@@ -266,7 +266,7 @@ def _scale_factors(singular: Sequence[int], mass: Array, G: Array) -> Array:
     own /= np.maximum(rows.max(axis=1, initial=0.0), np.finfo(float).tiny) ** 2
     ratio = own / (np.abs(mass).max() / rows.max() ** 2)
     smaller = (ratio > 0.0) & ~rows[:, ~covered].any(axis=1)
-    # with + 0.25, the factor is 1 if `ratio` (light / heavy inertia) is above SCALE_STEP ** -1.25: no digit is lost
+    # with + 0.25, the factor is 1 if `ratio` (light / heavy inertia) > SCALE_STEP ** -1.25, which costs no digit
     steps = np.ceil(np.log(np.where(smaller, ratio, 1.0)) / np.log(SCALE_STEP) + 0.25)
     return np.asarray(SCALE_STEP ** np.minimum(steps, 0.0))
 
@@ -308,7 +308,7 @@ class Elimination:
     def __init__(self, system: ConstrainedSystem, choice: PivotChoice, equations: Equations | None = None):
         self.equations = Equations(system) if equations is None else equations
         self.system, self.choice, self.graph = system, choice, self.equations.graph
-        self.zero, self._n_reduced = Affine(self.graph, 0.0, {}), 0  # _n_reduced: operations added by `reduced_program`
+        self.zero, self._n_reduced = Affine(self.graph, 0.0, {}), 0  # `reduced_program` adds _n_reduced operations
         n, (self.q, self.v) = system.n_q, (self.equations.q, self.equations.v)
         self.mass = self._callback_terms("mass")
         rows = [self._callback_terms("jacobian"), self._callback_terms("nonholonomic")]
@@ -369,7 +369,7 @@ class Elimination:
         return matrix
 
     def _solve(self, r: Sequence[Affine], c: Sequence[Affine]) -> tuple[list[Affine], list[tuple[Affine, Affine]]]:
-        """Solve M a + G^T lam = r, G a = c, with c of redundant rows, too; return [a, lam] and conditions (see Program)."""
+        """Solve M a + G^T lam = r, G a = c (all rows); return [a, lam] (lam: independent rows), validity conditions."""
         return solve_refined(self.factors.solve, self.choice, self.mass, self.all_rows, r, c)
 
     def _right_sides(self, v: Sequence[Affine]) -> tuple[list[Affine], list[Affine]]:

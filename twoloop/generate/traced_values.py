@@ -89,7 +89,7 @@ class CallbackTraces:
         refuse_wrong_traces([self], system, t0, t1, q, v)
 
     def check_near_start(self, system: ConstrainedSystem, nearby: Array) -> None:
-        """Compare calls and traces at states `nearby`; raise Untraceable if they differ, else update `is_trusted`."""
+        """Compare calls and traces at states near a start; if they differ, raise Untraceable, else set `is_trusted`."""
         difference = None
         for states in (nearby, *nearby[:, None, :]):  # take all states at once; if a call raises, one by one
             try:
@@ -105,7 +105,7 @@ class CallbackTraces:
     def difference(self, system: ConstrainedSystem, states: Array, everywhere: bool = True) -> str | None:
         """Return a message about the first difference of calls and traces at states [t, q, v], or None if they agree.
 
-        If `everywhere`, the trace must not be finite where a call returns NaN or inf; otherwise ignore such values.
+        If `everywhere`, the trace must not be finite where a call returns NaN or inf; if not `everywhere`, it may be.
         """
         from twoloop.kernels.evaluation import checks as kernels
 
@@ -124,7 +124,7 @@ class CallbackTraces:
         else:
             is_agreeing |= ~finite
         largest = np.where(np.isfinite(bounds), bounds, 0.0).max(axis=0)
-        # scale for an entry: among all entries of the entry's callback, the largest bound on rounding errors
+        # the scale of an entry is the largest bound on rounding errors among all entries of its callback
         scales = np.repeat(np.maximum.reduceat(largest, np.cumsum(self.n_entries) - self.n_entries), self.n_entries)
         for k, entry in np.argwhere(~is_agreeing & ~(differences <= ROUNDING_DIFFERENCE * scales)):
             if not differences[k, entry] <= CLEAR_DIFFERENCE * scales[entry] or self._is_systematic(
@@ -215,7 +215,7 @@ Check = Callable[[CallbackTraces], None]  # function that compares traces with c
 
 
 def accept_traces(traced: CallbackTraces) -> None:
-    """Do not compare traces with calls: a `Check` for traces that compute no motion, or that are compared later."""
+    """Accept traces without a comparison with calls, for traces that compute no motion or are compared later."""
 
 
 def states_near_start(t0: float, t1: float, q: Array, v: Array) -> Array:
@@ -233,7 +233,7 @@ def states_near_start(t0: float, t1: float, q: Array, v: Array) -> Array:
 
 @cache
 def _random_directions(n_q: int) -> Array:
-    """Return random numbers between -1 and 1, the same in every call: for q, then for v, an array (N_NEARBY, n_q)."""
+    """Return random numbers between -1 and 1, always the same: an array (2, N_NEARBY, n_q), [0] for q and [1] for v."""
     return np.random.default_rng(6).uniform(-1.0, 1.0, (2, N_NEARBY, n_q))
 
 

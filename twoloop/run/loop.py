@@ -306,7 +306,7 @@ class IntegrationLoop:
 
     @contextmanager
     def _deadline_timer(self) -> Iterator[None]:
-        """While this context is active, a timer stops machine code at the deadline (not in small compiled systems)."""
+        """While active, this context stops machine code at the deadline by a timer (not in small compiled systems)."""
         run, notes = self.run, self.run.work.notes
         if self.deadline == np.inf or (run.system.n_q <= SMALL_SYSTEM and not run.system.called_in_python):
             yield
@@ -363,7 +363,7 @@ class IntegrationLoop:
             self.code = INTERRUPTED
 
     def _choose_method(self, in_crossing: bool, n_steps: int) -> None:
-        """If `self.code` asks to change the method, form or state, or to compile, do so; set PAUSED to go on."""
+        """Change method, form or state, or compile, if `self.code` asks for it; then set PAUSED if the run goes on."""
         run, a = self.run, self.run.a
         if self.code == a.NEEDS_DENSE or run.may_succeed_in_other_form(self.code):
             run.change_form()

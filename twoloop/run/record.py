@@ -116,7 +116,7 @@ def read_arrays(folder: Path) -> dict[str, NDArray[Any]]:
 
 Array = NDArray[np.float64]
 
-MAX_PENDING_STATES = 1024  # number of states that may wait until intervals are searched for events and output times
+MAX_PENDING_STATES = 1024  # if more states than this are pending, the intervals before them are searched for events
 
 
 class OutputRequest(NamedTuple):
@@ -147,8 +147,8 @@ class OutputRequest(NamedTuple):
 class Recorder:
     """Recorder of the states of accepted steps, which it receives in chunks (steps of one call of compiled code).
 
-    The polynomial of a step also interpolates later states. A step is searched for events only when those states are
-    known: so results do not depend on chunk sizes. Event functions are evaluated at least every `max_gap` seconds.
+    The polynomial of a step also passes through states after the step. The step is searched for events only when these
+    are known, so that results do not depend on chunk sizes. Event functions are evaluated at least every `max_gap` s.
     """
 
     def __init__(
@@ -238,7 +238,7 @@ class Recorder:
         return None if self.search is None else self.search.ended
 
     def search_intervals(self, end: int | None = None) -> None:
-        """Search the intervals before pending state `end` (None: the last) for events; store states at output times."""
+        """Search intervals before `end`, index of a pending state (None: the last), for events; store output states."""
         end = len(self._t) - 1 if end is None else end
         interpolator = self.interpolator
         if interpolator is None or self.end_event is not None or self.interrupted:
@@ -307,7 +307,7 @@ class Recorder:
         return DenseSolution(self.interpolator, table, end if self.end_event is None else self.end_event[1])
 
     def events(self) -> tuple[list[Array], list[Array], list[Array]] | tuple[None, None, None]:
-        """Return times, q and v of events: lists of one array per event function, or three None if there is none."""
+        """Return times, q and v of events: lists of one array per event function; all None if no event is requested."""
         if self.search is None:
             return None, None, None
         n = self._n_q

@@ -279,7 +279,7 @@ class SampledRun:
         self._parameters_changed = True
 
     def _check_enters_forces_only(self, index: int, value: float) -> None:
-        """Raise ValueError if a new `value` of a parameter changes other callbacks than forces: states would jump."""
+        """Raise ValueError if a new `value` of parameter `index` changes more than forces: states would jump."""
         old_value, n = float(self.p[index]), self.system.n_q
         t, row = self.times[-1], self.rows[-1]
         state = {"q": row[:n], "v": row[n : 2 * n]}

@@ -126,7 +126,7 @@ register_model(Reference)(models.OpaqueModel)
 def _unbox(typ: Any, obj: Any, c: Any) -> NativeValue:
     """Emit code that converts an argument, the Python object of a structure, to a pointer to its table.
 
-    The argument has an attribute `address`, or is this address itself, an integer: this saves 0.1 microseconds.
+    The argument has an attribute `address`, or is the address itself: passing an integer saves 0.1 microseconds.
     """
     python_type = c.builder.load(
         c.builder.gep(c.builder.bitcast(obj, obj.type.as_pointer()), [ir.Constant(ir.IntType(32), 1)])

@@ -21,11 +21,11 @@ CONVERGED, REJECTED, GUESSED, NOT_COMPUTED = range(4)
     DEGREE,  # degree of the polynomial that predicts the accelerations in this step
     PREDICTS,  # 1: a polynomial predicts the accelerations in this step; 0: they are predicted to be constant
     CURRENT,  # index, 0 or 1, of the stored polynomial that belongs to the last accepted step
-    TRIED,  # 1: of the two stored polynomials, the one not at CURRENT belongs to the step just attempted; 0: none does
+    TRIED,  # 1: of the two stored polynomials, the one not at CURRENT belongs to the attempted step; 0: it does not
     NEXT_DEGREE,  # degree of the polynomial that will predict the accelerations in the next step
     OLD_DEGREE,  # value of DEGREE before a rejected step; the next accepted step restores it; 0: nothing to restore
-    MAY_GUESS,  # 1: the step size is a guess, replaced if RHO is not from FAST_START to SLOW_START; 0: it is final
-    N_MASS_FIRST,  # number of steps left in which elimination begins with the mass matrix, as a pivot was too small
+    MAY_GUESS,  # 1: the step size is a guess, replaced if RHO is below FAST_START or above SLOW_START; 0: it is final
+    N_MASS_FIRST,  # number of next steps that begin elimination with M, because the shorter elimination was inaccurate
     N_GUESSES,  # number of guesses of the first step size so far
     N_STEPS,  # number of accepted steps since the method began
     LIMITED,  # count that shows stiffness: steps limited in size by convergence add 1; others subtract 1, down to 0
@@ -42,7 +42,7 @@ CONVERGED, REJECTED, GUESSED, NOT_COMPUTED = range(4)
     FACTOR_OF_DEFECT,  # (next step size) / (size of this step) for which the defect should equal the allowed defect
     ALLOWED_H,  # largest size (s) with which the last step would have satisfied the error test
     SIZE,  # largest |v| + H |a| (H: step size) where the step begins, relative to tolerances: scale of rounding errors
-    STRICTER,  # changes by sweeps are multiplied by this: (largest of all WEIGHTS) / (largest for iterated coordinates)
+    STRICTER,  # factor on changes in a sweep: (largest of all WEIGHTS) / (largest of WEIGHTS of iterated coordinates)
     REPEATS,  # 1: a sweep (iteration) evaluates accelerations at old, then at new velocities; 0: only at old velocities
 ) = range(29)
 POWERS = 32  # index of the first of eight numbers: powers 1 to 8 of (size of this step / size of the step before)

@@ -59,11 +59,11 @@ def affine_sum(nodes, table, columns, numbers, coefficients, constant, begin, en
 
 @exact
 def run_table(table, rows, n_rows, columns, numbers, coefficients, constants, nodes, inputs, t, q, v):
-    """Do the operations of a program: store t, q, v in `nodes` from index `inputs` on, then the results of operations.
+    """Do the operations of a program; store t, q, v (from index `inputs` on) and the results of operations in `nodes`.
 
-    The vector `table` (integers, or floats without a fraction) contains a row for each operation, from index `rows` on,
-    and for each term the index of the node that it multiplies, from index `columns` on. The vector `numbers` contains
-    coefficients of terms from index `coefficients` on, and two constants for each row from index `constants` on.
+    The vector `table` (integers, or floats without a fraction) contains a row for each operation; the first row begins
+    at index `rows`. From index `columns` on, `table` contains the index of each term's node. The vector `numbers`
+    contains the terms' coefficients from index `coefficients` on, and two constants per row from `constants` on.
     """
     nodes[inputs] = t
     for j in range(q.size):
@@ -87,7 +87,7 @@ def _run_program(program, numbers, nodes, t, q, v):
 
 @exact
 def _result_indices(program):
-    """Return the number of results, the index of the first in `nodes`, and where `program` lists output indices."""
+    """Return how many results a program has, where they begin in `nodes`, and where it lists their output indices."""
     n = program[N_RESULTS]
     return n, program[N_NODES] - n, N_SIZES + N_COLUMNS * program[N_ROWS] + program[N_TERMS]
 

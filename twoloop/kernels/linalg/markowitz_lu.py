@@ -111,7 +111,7 @@ def index_of_lower_begins(r):
 
 @merged
 def index_of_entries(r):
-    """Return the offset of three lists in a program for r rows: row, column, source (see SOURCES) of factor entries."""
+    """Return where lists of rows, columns and SOURCES of the factors' entries begin in a program for r rows."""
     return N_HEAD + 6 * r + 1
 
 

@@ -115,12 +115,12 @@ def _clear_rounding_errors(coordinates, rounding):
 
 @compiled
 def iterate_accelerations(f, w, options, tolerances, t, h, q, v, A_stage, Q_stage, V_stage, q1, v1, rounding):
-    """Compute a step of size h from (q, v) by iterating on stage accelerations; return a code and `prediction_error`.
+    """Compute a step of size h from (q, v) by iterating on stage accelerations; return a code and a position error.
 
-    A_stage (s, n) contains predicted accelerations on entry, and the solution on return; (q1, v1) becomes the end of
-    the step, on the constraints. The stages Q_j = q + c_j h v + h^2 sum_k (A A)_jk a_k and V_j = v + h sum_k A_jk a_k
-    (A, c: Butcher tableau) then satisfy eq. (17) of the paper. For undamped systems, an iteration gains as much
-    accuracy as two by `iterate_first_order`. If `rounding` has rows, sums are compensated for rounding errors.
+    A_stage (s, n): predicted accelerations, on return final ones. (q1, v1) becomes the projected end of the step.
+    The stages Q_j = q + c_j h v + h^2 sum_k (A A)_jk a_k and V_j = v + h sum_k A_jk a_k (A, c: Butcher tableau) satisfy
+    eq. (17) of the paper. If `rounding` has rows, rounding errors of sums are compensated. The position error is
+    `prediction_error` of q1. For undamped systems, one iteration gains as much as two by `iterate_first_order`.
     """
     s, A, A2, b, bA, c = tableau_of(options)
     n = q.size

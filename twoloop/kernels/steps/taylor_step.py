@@ -53,9 +53,9 @@ from twoloop.kernels.linalg.saddle_point import solve_with_multipliers
 # 13 arrays describe a list of operations (OperationGroups in twoloop.generate.series). Array 0 contains the groups of
 # operations of the same kind, arrays 1 to 6 the first argument of each operation, arrays 7 to 12 the second argument
 GROUPS, FIRST, SECOND, N_TABLE = 0, 1, 7, 13
-# six arrays describe a list of affine expressions (Sums in twoloop.generate.series), such as first arguments. For each
-# expression, three of them have the quantity (COLUMN) and factor (COEFFICIENT) of its first term, and its CONSTANT. For
-# each other term, the other three have its expression (ROW), quantity (MORE_COLUMN) and factor (MORE_COEFFICIENT)
+# six arrays describe a list of affine expressions (Sums in twoloop.generate.series), such as first arguments. Three
+# have an entry per expression: CONSTANT, and quantity (COLUMN) and factor (COEFFICIENT) of the first term. Three have
+# an entry per further term: its expression (ROW), quantity (MORE_COLUMN) and factor (MORE_COEFFICIENT)
 COLUMN, COEFFICIENT, CONSTANT, ROW, MORE_COLUMN, MORE_COEFFICIENT, N_SUMS = range(7)
 SUM_INDICES = N_SUMS  # seventh array, if the expressions belong to equations: index of each expression's equation
 # the series program is a list of arrays; its four parts begin at these indices. EARLY: operations on t and q only.
@@ -63,8 +63,8 @@ SUM_INDICES = N_SUMS  # seventh array, if the expressions belong to equations: i
 EARLY, LATE, ROWS = 0, N_TABLE, 2 * N_TABLE
 BALANCE, N_ARRAYS = ROWS + N_SUMS + 1, ROWS + 2 * (N_SUMS + 1)
 # columns of the array GROUPS, which has a row for each group of operations. KIND: kind of operation. BEGIN, END: the
-# range of the group's operations. MORE_FIRST and the next column: the range of first arguments' terms in the array
-# MORE_COLUMN. MORE_SECOND and the next column: the range of second arguments' terms
+# range of the group's operations. MORE_FIRST and the next column: the range of entries in MORE_COLUMN that belong to
+# first arguments. MORE_SECOND and the next column: the range of entries in MORE_COLUMN that belong to second arguments
 KIND, BEGIN, END, MORE_FIRST, _, MORE_SECOND, _, N_GROUP = range(8)
 
 # indices of the scalars in `memory`. Two Taylor series of q (ORDER + 1, n_q each) and arrays (`array_views`) follow.
@@ -149,8 +149,8 @@ def _fill_arguments(options, sums, groups, g, more, values, out):
     """Compute the first or the second arguments of all operations of a group; store these arguments in `out`.
 
     Arguments are affine expressions in `values`, the Taylor coefficients of one order of all quantities; constants are
-    left out, as they belong to order 0. `sums`: index of the first of the arrays of these expressions (COLUMN).
-    `g`: index at which the group's row begins in `groups`. `more`: MORE_FIRST or MORE_SECOND.
+    left out, as they belong to order 0. `sums`: index of the first array (COLUMN) that describes these expressions.
+    `g`: where the group's row begins in `groups`. `more`: MORE_FIRST for first arguments, MORE_SECOND for second ones.
     """
     column, coefficient = _integer_array(options, sums + COLUMN), _float_array(options, sums + COEFFICIENT)
     for o in range(groups[g + BEGIN], groups[g + END]):
@@ -163,7 +163,7 @@ def _fill_arguments(options, sums, groups, g, more, values, out):
 
 @merged
 def _store_sums(options, sums, scale, values, out):
-    """Store `scale` times the known non-constant terms of G v + (C_t, b) (ROWS) or Q - G^T lam - M a (BALANCE)."""
+    """Store scale * (known variable terms of G v + (C_t, b) if sums = ROWS, of Q - G^T lam - M a if sums = BALANCE)."""
     column, coefficient = _integer_array(options, sums + COLUMN), _float_array(options, sums + COEFFICIENT)
     indices = _integer_array(options, sums + SUM_INDICES)
     for o in range(column.size):
@@ -384,8 +384,8 @@ def compute_coefficients(f, w, options, memory, t, state, unit):
 
 # aim of the step sizes: (distance of the end of a step from the constraints, before projection) / (allowed distance)
 TARGET_PREDICTION_ERROR = 0.3
-# the defect at NEAR_BEGIN, near the beginning of a step, is due to rounding, because the series is exact there. A later
-# defect counts as rounding error if it is at most NOISE_RATIO times the former and MAX_NOISE * (allowed defect)
+# the series is exact near the beginning of a step: defects at k * NEAR_BEGIN (k = 1, 2, 3) are due to rounding. A later
+# defect is a rounding error if it is at most NOISE_RATIO * (largest of these) and at most MAX_NOISE * (allowed defect)
 MAX_NOISE, NOISE_RATIO = 1e4, 10.0
 NEAR_BEGIN = 1e-5  # time from the beginning of a step to a state where the series is exact, relative to the step size
 # the defect is checked at equidistant times within a step. At each attempt, these times shift by this fraction of their
@@ -400,7 +400,7 @@ TOO_SHORT = 2.0  # error returned for a first step much shorter than its series 
 
 @merged
 def _compute_series(f, w, options, memory, t, state, unit, index):
-    """Compute the Taylor series about `state`, the state projected last; store it as series `index` (0 or 1)."""
+    """Compute the Taylor series about `state`, which was just projected, and store it as series `index` (0 or 1)."""
     n = w.Q.size
     memory[TARGET] = index
     if f.is_generated == 1 and w.used_general == 0.0:  # generated code has stored no factors in w: compute the factors
@@ -556,7 +556,7 @@ def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
         was_near_singular = w.nearly_singular != 0.0  # True if the run is, or has been, near a singular position
         # near a singular position, check no defect: small violations of constraints by the series spoil accelerations
         checks_defect = w.near_now == 0.0
-        w.near_now = 0.0 if checks_defect else 2.0
+        w.near_now = 0.0 if checks_defect else 2.0  # 2 requests an update of w.pivot after the step
         ratio_to_gap = gap_ratio(tolerances, h)
         if ratio_to_gap > 0.0 and was_near_singular:
             return Attempt(DONE, ratio_to_gap, 1.0 / ratio_to_gap)
