@@ -111,7 +111,7 @@ def index_of_lower_begins(r):
 
 @merged
 def index_of_entries(r):
-    """Return where lists of rows, columns and SOURCES of the factors' entries begin in a program for r rows."""
+    """Return where three lists begin in a program for r rows: rows, columns and SOURCES of factor entries."""
     return N_HEAD + 6 * r + 1
 
 

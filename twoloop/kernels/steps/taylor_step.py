@@ -163,7 +163,7 @@ def _fill_arguments(options, sums, groups, g, more, values, out):
 
 @merged
 def _store_sums(options, sums, scale, values, out):
-    """Store scale * (known variable terms of G v + (C_t, b) if sums = ROWS, of Q - G^T lam - M a if sums = BALANCE)."""
+    """Store in `out` scale * (known variable terms of G v + (C_t, b) for ROWS, of Q - G^T lam - M a for BALANCE)."""
     column, coefficient = _integer_array(options, sums + COLUMN), _float_array(options, sums + COEFFICIENT)
     indices = _integer_array(options, sums + SUM_INDICES)
     for o in range(column.size):
