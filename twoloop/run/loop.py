@@ -363,7 +363,7 @@ class IntegrationLoop:
             self.code = INTERRUPTED
 
     def _choose_method(self, in_crossing: bool, n_steps: int) -> None:
-        """Change method, form or state, or compile, as `self.code` asks; `self.code` becomes PAUSED to go on."""
+        """Change method, form or state, or compile, as `self.code` asks; if the run goes on, set it to PAUSED."""
         run, a = self.run, self.run.a
         if self.code == a.NEEDS_DENSE or run.may_succeed_in_other_form(self.code):
             run.change_form()
