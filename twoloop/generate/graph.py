@@ -22,7 +22,7 @@ from twoloop.generate.parameter_expressions import (
 from twoloop.generate.parameter_expressions import Untraceable as Untraceable
 from twoloop.kernels.evaluation import operations as op
 
-# derived callbacks and Taylor series with more operations are not generated: to trace these takes longer than most runs
+# derived callbacks and Taylor series with more operations than this are refused: tracing takes longer than most runs
 MAX_TRACED_OPERATIONS = 20_000
 # products that differ by a constant factor are recorded once, without this factor. To avoid underflow and overflow, a
 # product is recorded with its factor if |factor| is not between MIN_FACTOR and 1 / MIN_FACTOR. Squares that yield a
@@ -164,7 +164,7 @@ class Graph(SymbolicObject):
         return order
 
     def product(self, a: "Affine", b: "Affine") -> "Affine":
-        """Return a * b as a number times a recorded product; products that differ by a constant factor share one."""
+        """Return a * b as a number times a recorded product; products that differ by a factor share this one."""
         if not a.terms:
             return b.times(a.constant)
         if not b.terms:
@@ -183,7 +183,7 @@ class Graph(SymbolicObject):
         return self.operation(op.PRODUCT, a, b)
 
     def square(self, expr: "Affine", is_high_power: bool) -> "Affine":
-        """Return `expr` squared; if `is_high_power`, record it with the constant factor of `expr`, else without."""
+        """Return `expr` squared. If `is_high_power`, the recorded square includes the constant factor of `expr`."""
         return self._product(expr, expr) if is_high_power and expr.terms else self.product(expr, expr)
 
 
@@ -266,7 +266,7 @@ class Affine:
         for i, c in other.terms.items():
             total = terms[i] + c if i in terms else c
             if _magnitude(total) <= CANCELLATION_LIMIT * _magnitude(c):
-                terms.pop(i, None)  # `terms` need not contain i: a new coefficient c may have underflowed to 0
+                terms.pop(i, None)  # i is missing in `terms` if its coefficient c is new, and has underflowed to 0
             else:
                 terms[i] = total
         if _equal(other.constant, 0.0):

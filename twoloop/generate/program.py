@@ -100,7 +100,7 @@ class Program:
         return self.graph.quantities_for(self.expressions, available)
 
     def cost(self) -> int:
-        """Return the number of multiplications and additions; a reciprocal counts as four, other functions as zero."""
+        """Return the cost of a program in multiplications and additions; see COSTS for the cost of other operations."""
         exprs, total = self.expressions, 0
         for i in self.quantities():
             kind, *_ = self.graph.operations[i]  # type: ignore[misc]

@@ -101,7 +101,7 @@ def keep_unused_workspace(work: Work) -> None:
     unused = _unused_workspaces.pop(work.sizes, [])
     if work.notes.base.size <= MAX_UNUSED_SIZE and len(unused) < MAX_UNUSED:
         unused.append(work)
-    # insert these sizes at the end of the dictionary: so it begins with the sizes that were used longest ago
+    # insert these sizes at the end of the dictionary. The sizes used longest ago, at its beginning, are discarded first
     _unused_workspaces[work.sizes] = unused
     for oldest in list(_unused_workspaces)[:-1]:
         if sum(map(len, list(_unused_workspaces.values()))) <= MAX_UNUSED:

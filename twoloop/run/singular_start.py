@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 CHANGE_PER_SAMPLE = 3e-3  # finite differences in time use samples between which C_q changes by about this fraction
 # weights of five equidistant samples in finite differences; row 0: first derivative, row 1: second derivative
 WEIGHTS = np.array([[1.0, -8.0, 0.0, 8.0, -1.0], [-1.0, 16.0, -30.0, 16.0, -1.0]]) / 12.0
-# assumed relative error of differences: dC_q/dt counts as 0 if a displacement of max|q| changes C_q by less than this
+# assumed relative error of differences. dC_q/dt counts as 0 if moving by max|q| changes C_q by less than this fraction
 MAX_DIFFERENCE_ERROR = 1e-8
 # the rank of C_q rises along the motion if (ds/dt) / |dC_q/dt| exceeds this; s: a singular value, zero at the start
 MIN_RANK_DERIVATIVE = 1e-6
@@ -59,8 +59,8 @@ def branch_at(system: ConstrainedSystem, t: float, state: Array, rank: int, allo
 
     `state`: [q, v, a] at the start; `rank`: rank of C_q at the start. The start counts as not singular if the rank does
     not rise along the motion, if C depends on t, or if non-holonomic constraints exist. The branch is not certain if
-    velocities of another branch may be closer to v than the tolerances `allowed` (n_q,), or if no state on the branch
-    was found.
+    velocities of another branch may be closer to v than the tolerances `allowed` (n_q,), if the residual of a exceeds
+    MAX_RESIDUAL, or if no state on the branch was found.
     """
     if system.n_a > 0 or "constraint_rate" in system.given or not 0 < rank < min(system.n_c, system.n_q):
         return None

@@ -201,7 +201,7 @@ def _is_equal(A, B):
 
 @merged
 def factor_schur_complement(f, w):
-    """Store new factors of G M^-1 G^T in w.S, unless M is constant and G is unchanged; return a status code."""
+    """Factor G M^-1 G^T in w.S, unless M is constant and w.S already has the factors for this G; return a code."""
     is_constant = f.constant_mass == 1
     if is_constant and _is_equal(w.G, w.G_of_S):
         return DONE
@@ -242,7 +242,7 @@ def solve_by_schur_complement(f, w, r, c, a):
 
 
 # the augmented form is used with at least MIN_ROWS constraints (measured: fastest from 7 on) and at least MIN_ROWS
-# degrees of freedom. If M is not diagonal, fewer of these suffice with MIN_COORDINATES coordinates (measured: about 30)
+# degrees of freedom. If M is not diagonal, these may be fewer from MIN_COORDINATES coordinates on (measured: about 30)
 MIN_ROWS = 8
 MIN_COORDINATES = 32
 

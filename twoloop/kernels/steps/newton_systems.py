@@ -258,7 +258,7 @@ def _fill_jacobians_from_tangents(f, w, tolerances, memory, s, t, q, v):
 
 @compiled
 def _fill_by_differences(f, w, options, tolerances, t, q, v, a, by_v, q_moved, v_moved, a_new, J):
-    """Store in J the derivative of accelerations by q_i (if `by_v`, by v_i), as differences from `a` at (t, q, v)."""
+    """Store in J the derivative of accelerations by q_i (if `by_v`, by v_i); `a`: accelerations at (t, q, v)."""
     base, moved = (v, v_moved) if by_v else (q, q_moved)
     sizes = _displacement_sizes(tolerances, base)
     for column in range(w.independent.size):
@@ -840,7 +840,7 @@ def solve_system(f, w, options, memory, s, k, x):
     If this eigenvalue is real, only the real part of x is used, and the solution is real.
     """
     n = w.Q.size
-    if k == 0 and options[newton_options_index(s) + at.N_REAL] > 0.0:  # a real eigenvalue: use `factor_filter`'s matrix
+    if k == 0 and options[newton_options_index(s) + at.N_REAL] > 0.0:  # eigenvalue k is real: use the filter's factors
         real_part, X = vector(memory, s, n, at.V_MOVED), vector(memory, s, n, at.Q_MOVED)
         for i in range(x.size):
             real_part[i] = x[i].real

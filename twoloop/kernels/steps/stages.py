@@ -320,7 +320,7 @@ def _storage_after_vectors(memory, s, n, k):
 
 @inlined
 def pivots_of(memory, s, n, k):
-    """Return a view (n) of `memory` with pivot indices: if k = 0, those of FILTER; if k > 0, of linear system k - 1."""
+    """Return the pivot indices (n) of the matrix in `filter_error` (k = 0), or of linear system k - 1 (k > 0)."""
     return _storage_after_vectors(memory, s, n, k)[:n].view(np.int64)
 
 
@@ -332,7 +332,7 @@ def complex_vector(memory, s, n, n_systems, index):
 
 @kernel(ATTEMPT)
 def request_loading(f, w, options, memory, t, h, tolerances, state, new_state):
-    """Return NOT_LOADED without a step: then the caller loads the machine code of the method, and tries again."""
+    """Take no step, and return NOT_LOADED; then the caller loads the machine code of the method, and tries again."""
     return Attempt(NOT_LOADED, np.inf, 0.0)
 
 
