@@ -164,7 +164,7 @@ class Graph(SymbolicObject):
         return order
 
     def product(self, a: "Affine", b: "Affine") -> "Affine":
-        """Return a * b as a number times a recorded product; products that differ by a factor share this one."""
+        """Return a * b as a number times a recorded product, the same one for all constant multiples of a and b."""
         if not a.terms:
             return b.times(a.constant)
         if not b.terms:

@@ -269,7 +269,7 @@ def _largest_value(work, offset, count, k):
     largest = 0.0
     for j in range(count):
         magnitude = abs(work[(offset + j) * LANES + k])
-        largest = largest if magnitude <= largest else magnitude  # the next number replaces a NaN
+        largest = largest if magnitude <= largest else magnitude  # the next number replaces a NaN in `largest`
     return largest
 
 
