@@ -244,10 +244,10 @@ class LaneSeries:
     def _shared_sums(self) -> dict[int, tuple[int, int]]:
         """Find products (cos x) x' and (sin x) x', whose sums the recurrences of sin x and cos x already compute.
 
-        (cos x) x' is the derivative of sin x. So the sum for coefficient k + 1 of sin x, divided by the unit of time,
-        is coefficient k of (cos x) x', except for the term that contains coefficient k of x', which is not known yet.
-        The sum for cos x serves for (sin x) x' in this way. In the returned dict, a key is the index of the product
-        among all quantities; the value (x, y) contains the indices of the two series in the sum, see `_factor_index`.
+        (cos x) x' is the derivative of sin x. So its coefficient k, without the term that contains the yet unknown
+        coefficient k of x', is the sum for coefficient k + 1 of sin x divided by the series' unit of time. Likewise,
+        (sin x) x' follows from the sum for cos x. In the returned dict, a key is the index of the product among all
+        quantities; the value (x, y) contains the indices of the two series in the sum, see `_factor_index`.
         """
         pairs: dict[Any, tuple[int, int]] = {}
         for operation in self.early:
@@ -421,7 +421,7 @@ class LaneSeries:
     ) -> None:
         """Write code for Taylor coefficient k = `order` > 0 of the results of `operations`; `inverse`: 1 / k.
 
-        The second factor of a PENDING product contains v, lam or a; terms with its unknown coefficient k are left out.
+        The second factor of a PENDING product contains v, lam or a: its coefficient k is not known yet, and left out.
         """
         pairs = list(dict.fromkeys(pair for operation in operations for pair in self._factors(operation)))
         sums = {}
@@ -487,10 +487,10 @@ class _Row:
 
 
 class _PartialSums(NamedTuple):
-    """Sums over 1 < j < k of X[j] Y[k - j] and X[j] Y[k + 1 - j]; functions sum_of_... add terms for j = 1 and k."""
+    """Sums over 1 < j < k of X[j] Y[k - j] and X[j] Y[k + 1 - j]; the methods add the terms j = 1 and j = k."""
 
     sums: dict[tuple[tuple[int, int], bool], Value]  # sums over 1 < j < k, from `LaneSeries._write_sums`
-    first_row: Value  # pointer to `row_1` if k > 1, else to a row of zeros: products with its entries are then 0
+    first_row: Value  # pointer to `row_1` if k > 1, to a row of zeros if k = 1: then a term of each sum does not exist
     row_1: Value  # pointer to coefficient 1 of all series
     row_before: _Row  # memory that contains coefficient k - 1 of all series
 
@@ -500,7 +500,7 @@ class _PartialSums(NamedTuple):
         return self.sums[pair, False] + emit.load(self.first_row, x) * self.row_before.load(y)
 
     def sum_of_next_order(self, pair: tuple[int, int], row: _Row) -> Value:
-        """Return the sum of X[j] Y[k + 1 - j] over 0 < j <= k; `pair`: indices of series X, Y; `row` stores X[k], Y[k]."""
+        """Return the sum of X[j] Y[k + 1 - j] over 0 < j <= k; `pair`: indices of X and Y; `row` stores X[k], Y[k]."""
         emit, (x, y) = self.row_before.emit, pair
         total = self.sums[pair, True] + row.load(x) * emit.load(self.first_row, y)
         return total + emit.load(self.row_1, x) * row.load(y)

@@ -37,7 +37,7 @@ def may_have_missed_changes(run: Run, limit: float = REPEAT_BELOW) -> bool:
 
 
 def gap_for_repetition(run: Run) -> float:
-    """Return the longest allowed time (s) between evaluations if a run is repeated, as it may have missed changes."""
+    """Return the longest allowed time (s) between evaluations when a run that may have missed changes is repeated."""
     a, clock = run.a, run.clock
     return float(max(clock[a.SHORTEST_CHANGE] / EVALUATIONS_PER_CHANGE, clock[a.WIDEST_SAMPLING] / MAX_REFINEMENT))
 
@@ -62,7 +62,7 @@ N_CORRECTIONS = 3  # number of Newton steps that suffice to reduce errors of pos
 NEGLIGIBLE_RATIO = 1e-12
 MAX_SCALINGS = 20  # largest number of iterations of `equilibrating_units`
 N_REFINEMENTS = 2  # number of times that a solution is corrected by the solution for its residual
-MAX_RESIDUAL = 1e-8  # limit of (residual of a constraint rate after a jump) / (sum of its |terms| + largest jump)
+MAX_RESIDUAL = 1e-8  # limit of residual / (sum of |terms| + max|r|) in rows of G dv = r (dv, r: jumps of v, -[C_t, b])
 
 
 def state_after_jump(system: ConstrainedSystem, t: float, q: Array, v: Array) -> Array | None:
@@ -180,8 +180,8 @@ class Limits(NamedTuple):
     has_wide_gaps: bool  # whether the longest allowed time between evaluations is multiplied by GAP_FACTOR
     may_approach: bool  # whether a step may end before the singular position, but nearer to it than the step began
     tolerance_factor: float  # factor by which the run's tolerances are multiplied in steps across the singular position
-    # factor on a limit: nodes of the polynomial with smaller pivots of C_q are left out, as their rounding errors are
-    # large. A smaller factor leaves out fewer nodes, which helps if the motion is slow near the singular position
+    # factor on the pivot of C_q below which nodes of the polynomial are left out because of large rounding errors. A
+    # smaller factor leaves out fewer nodes, which helps if the motion is slow near the singular position
     node_distance: float
 
 
@@ -235,8 +235,8 @@ def renew_kit(run: Run) -> None:
 def cross_singularity(run: Run, past: list[TimedState]) -> tuple[Plan, Array]:
     """Prepare steps across a singular position, see kernels/steps/crossing_step.py; return their plan and settings.
 
-    Set the first step size, and list the polynomials to try in `run.origins`. The settings are the array `control` that
-    `advance` reads. `past`: states of the last accepted steps, oldest first; may be empty.
+    Set the first step size, and store the polynomials to try as `run.origins`. The settings are the array `control`
+    that `advance` reads. `past`: states of the last accepted steps, oldest first; may be empty.
     """
     a, clock = run.a, run.clock
     from twoloop.kernels.steps.crossing_step import BACKWARD_FRACTION, NODE_GAP
@@ -263,7 +263,7 @@ def cross_singularity(run: Run, past: list[TimedState]) -> tuple[Plan, Array]:
     control[: a.N_RULE] = plan.rule
     control[a.SYMMETRIC], control[a.MAY_CROSS], control[a.MAX_ATTEMPTS] = 0.0, 0.0, 1.0
     control[a.MAY_SWITCH] = control[a.TAKES_MANY] = 0.0
-    run.piece_ends = []  # integrators reuse `run`, so that times of an earlier run may be left
+    run.piece_ends = []  # remove the times of an earlier run, for which the same object `run` was used
     if control[a.FIXED_STEP] == 0.0:
         control[a.MAX_EVALUATION_GAP] = 1.0 if run.forces_may_be_steep else NODE_GAP / (1.0 - BACKWARD_FRACTION)
     clock[a.LIMIT_AGE] = 0.0

@@ -63,7 +63,7 @@ class StallDetector:
         self.window_n += len(h)
 
     def is_stalled(self, t: float, t1: float) -> bool:
-        """Return whether a run to t1 is stalled at time t; False within STAGNATION_STEPS steps of the last check."""
+        """Return whether a run to t1 is stalled at time t; False for STAGNATION_STEPS steps after the last check."""
         if self.window_n < STAGNATION_STEPS:
             return False
         self.mean_step = (t - self.window_t) / self.window_n
@@ -225,7 +225,7 @@ _FAILURE_REASONS = {
 def message_of(run: "Run", text: str, system: "ConstrainedSystem") -> dict[str, Any]:
     """Return {"message": text}, or {"later": function} with a function that completes the text when it is first read.
 
-    A description of the singular positions that the run crossed takes longer than many runs: so a text with such a
+    To describe the singular positions that a run crossed takes longer than many runs: so a text that contains such a
     description is completed later. Until then `system` must not change, but the arrays of the run may.
     """
     if CROSSINGS_MARK not in text:

@@ -68,7 +68,7 @@ class SignalHandlers:
             raise self._handler_error from None
 
     def restore(self) -> None:
-        """Restore the handlers that the user has not replaced meanwhile; then call `call_delayed`."""
+        """Restore the user's handlers, unless the user has set new ones meanwhile; then call `call_delayed`."""
         for number, handler in self._user_handlers.items():
             if _signal.getsignal(number) == self._receive:
                 _signal.signal(number, handler)
@@ -84,7 +84,7 @@ class SignalHandlers:
 
 
 def signals_of(system: ConstrainedSystem) -> SignalHandlers:
-    """Return a context manager that, at its end, raises a signal handler's exception again if its block caught it."""
+    """Return a context manager. If its block catches an exception of a signal handler, raise the exception again."""
     return SignalHandlers(ctrl_c=system.called_in_python)
 
 

@@ -221,8 +221,8 @@ def _stiff_rows(
 ) -> list[int]:
     """Choose the rows g of C_q for which g^T g is added to a singular M to make it invertible; return their indices.
 
-    See sparse_ldl.py. A row must belong to one body (as for the norm of Euler parameters), so that g^T g has no entries
-    where M has none. Rows are chosen only until M is invertible.
+    See sparse_ldl.py. Each row contains coordinates of one body only, such as the row for the norm of Euler parameters,
+    so that g^T g has no entries where M has none. Rows are chosen only until M is invertible.
     """
     values = system.mass_values(t0, q0) if "mass" in system.entries else system.mass(t0, q0)[mass]
     body_of = np.array(bodies_of(system.n_q, mass, bodies))
@@ -380,7 +380,7 @@ def kit_for_plan(system: ConstrainedSystem, flags: Array, plan: Plan | None) -> 
 
 
 def _steps_of_plan(plan: Plan) -> tuple[Any, Any, Any]:
-    """Return a plan's Step, and both Steps of its pair (None: it has no pair; PLACEHOLDER_STEP: not imported yet)."""
+    """Return a plan's Step and the Steps of its pair (None: no pair; PLACEHOLDER_STEP: its second is not imported)."""
     return load_step(plan.step), load_step(plan.first), step_if_loaded(plan.second)
 
 

@@ -158,7 +158,7 @@ _warnings: list[str] = []  # the warning that `_warn_first` has printed; empty i
 
 
 def _warn_first(text: str) -> None:
-    """Print a warning about files of other users on stderr, but only the first one in this process."""
+    """Print a warning on stderr that other users can write code files; in a process, only the first call prints."""
     if not _warnings:
         _warnings.append(text)
         print(text, file=sys.stderr, flush=True)
@@ -407,7 +407,7 @@ def digests_of(function: Callable[..., Any]) -> tuple[str, str] | None:
 
 
 def _digests_and_helpers(function: Callable[..., Any]) -> tuple[tuple[str, str] | None, list[Any]]:
-    """Return two digests of a function or None, see `digests_of`, and its helpers, each after those that it calls."""
+    """Return the result of `digests_of` for a function, and its helpers, each one after the helpers that it calls."""
     code, closure = Digest(), Digest()
     closure.names = reachable_names(function)  # if a closure variable is a module, hash its attributes with these names
     try:

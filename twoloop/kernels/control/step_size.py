@@ -66,7 +66,7 @@ def record_accepted_step(rule, past, h, error):
 @compiled
 def project_and_evaluate(f, w, t, Q, V, A):
     """Project the state (Q, V) onto the constraints; store its accelerations in A; return DONE or a failure code."""
-    # the task EVALUATE is slower in generated code, and does not project in the fixed-order form: use the task PROJECT
+    # the task EVALUATE is slower than PROJECT with generated code, and need not project in the fixed-order form
     if (f.is_generated == 1 and w.Rate.size == w.C.size) or f.form == FIXED_ORDER:
         return f.inner(f, w, PROJECT, t, Q, V, INNER_TOL, A, w.lam)
     return evaluate(f, w, t, Q, V, INNER_TOL, A)
@@ -160,8 +160,8 @@ def store_prediction(w, q1):
 def prediction_error(w, tolerances, h, q, v, q1):
     """Return the largest |w.predicted - q1| (dependent positions) / (allowed error), for a step from (q, v) to q1.
 
-    The formula predicted w.predicted; q1 satisfies C = 0. The allowed error is the tolerance, but at most about
-    a fraction of the largest displacement: FRACTION_OF_MOTION, or FRACTION_AT_SIGN_CHANGE if det C_qd changes sign.
+    The formula predicted w.predicted; q1 satisfies C = 0. The allowed error is the tolerance or, if smaller, about
+    this fraction of the largest displacement: FRACTION_OF_MOTION; FRACTION_AT_SIGN_CHANGE if det C_qd changes sign.
     w.orientation_new becomes the sign of det C_qd, from its factors in `w`. If steps have a fixed size, only return 0.
     """
     if tolerances[ESTIMATE] == 0.0:

@@ -53,15 +53,15 @@ from twoloop.kernels.linalg.dense import copy
 # the largest rate is first estimated after FIRST_ESTIMATE evaluations of the equations, later every BETWEEN_ESTIMATES
 # evaluations. While the explicit method is active, both numbers are multiplied by options[COST_RATIO]
 FIRST_ESTIMATE, BETWEEN_ESTIMATES = 100.0, 600.0
-N_POWER_ITERATIONS = 4  # number of power iterations by dF/dq, and largest number of those by dF/dv (F: accelerations)
-NEGLIGIBLE_DAMPING = 1e-3  # power iterations by dF/dv (F: acceleration) end if eigenvalue * step size is below this
+N_POWER_ITERATIONS = 4  # number of power iterations with dF/dq, and largest number with dF/dv (F: accelerations)
+NEGLIGIBLE_DAMPING = 1e-3  # power iterations with dF/dv (F: accelerations) end if eigenvalue * step size is below this
 ZERO_REPLACEMENT = 1e-3  # replaces zero components of the vector of a power iteration, whose largest component is 1
 URGENT_RATIO = 3.0  # a trial is urgent (cost cannot delay it) if step size * largest rate / stability limit > this
 # if Jacobians are computed by finite differences (about eight evaluations per coordinate), a trial that is not urgent
 # (see URGENT_RATIO) also waits until the run has cost this number of evaluations per independent coordinate
 MIN_COST_PER_COORDINATE = 64.0
 TRIAL_COST = 300.0  # approximate cost of a trial of the implicit method, in evaluations of the implicit method
-MIN_COST_IN_TRIALS = 3.0  # a trial begins only if urgent (URGENT_RATIO), or if run's cost / trial's cost exceeds this
+MIN_COST_IN_TRIALS = 3.0  # unless urgent, a trial waits until (cost of the run) / (cost of a trial) exceeds this
 COUNTED_FRACTION_OF_RUN = 0.3  # when a trial is considered, a run's cost counts as at least this * its expected total
 # however small the largest rate is, a first trial begins when the run has cost as much as
 # COST_OF_ANY_TRIAL * MIN_COST_IN_TRIALS trials. After k trials, the next one begins at k + 1 times this cost
@@ -94,8 +94,8 @@ LIMIT, N_ESTIMATES, MATRIX_COST, COST_RATIO, SIZE_1, N_PAIR = range(6)
 REUSE_OF, N_OF_EACH = N_RULE, N_RULE + 1
 N_OPTIONS = N_PAIR + 2 * N_OF_EACH  # index in `options` where the options of the first method begin
 
-# indices of the first N_SCALARS numbers in `memory`. The vectors (n_q each) of the power iterations by dF/dq and dF/dv
-# (F: accelerations) follow, then the memories of both methods
+# indices of the first N_SCALARS numbers in `memory`. The vectors (n_q each) of the power iterations with dF/dq and
+# dF/dv (F: accelerations) follow, then the memories of both methods
 (
     PHASE,  # which method is in use or on trial: EXPLICIT, ON_TRIAL, IMPLICIT or BACK_ON_TRIAL
     STEPS,  # number of accepted steps since PHASE, the method in use or on trial, last changed
@@ -114,8 +114,8 @@ N_OPTIONS = N_PAIR + 2 * N_OF_EACH  # index in `options` where the options of th
     H_TRIED,  # size of the last attempted step (s)
     ERROR_TRIED,  # error of the last attempted step, in tolerances
     N_TRIALS,  # number of trials so far
-    # number of estimates of step size * (largest rate) above LIMIT. A lower estimate sets the number to 0, unless the
-    # run has cost too little for a trial
+    # number of estimates of step size * (largest rate) that were above LIMIT. An estimate below LIMIT sets the number
+    # to 0 if a trial is cheap, compared with the cost of the run
     N_ABOVE_LIMIT,
     N_SCALARS,
 ) = range(19)
@@ -135,7 +135,7 @@ def switching_options(
     `limit`, `estimates`, `matrix_cost` and `ratio` are the values of LIMIT, N_ESTIMATES, MATRIX_COST and COST_RATIO.
     `rules` has a row of N_OF_EACH numbers (see LIMIT) for each method. `first` and `second`: the methods' own options.
     """
-    first = np.asarray(first)  # contains numbers or, in code for all parameters, expressions of parameters
+    first = np.asarray(first)  # numbers or, if one trace serves all values of parameters, `Parameter` objects
     scalars = [limit, float(estimates), matrix_cost, ratio, float(first.size)]
     return np.concatenate([scalars, np.asarray(rules, dtype=np.float64).ravel(), first, np.asarray(second)])
 
@@ -204,7 +204,7 @@ def _largest_rate(f, w, memory, t, state, new_state):
     by_q, by_v = memory[N_SCALARS : N_SCALARS + n], memory[N_SCALARS + n : N_SCALARS + 2 * n]
     Q, V, A = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n]
     growth_by_q = growth_by_v = 0.0
-    # generated code does not renew the partition, whose independent coordinates may hardly move now: choose a new one
+    # generated code does not renew the partition: its independent coordinates may hardly move now, so choose others
     is_explicit = memory[PHASE] == EXPLICIT
     if is_explicit and f.is_generated == 1 and renew_partition(f, w, t, state[:n]) != DONE:
         return 0.0
@@ -331,14 +331,14 @@ def _phase_to_begin(f, w, options, memory, tolerances, t, state, new_state):
         is_hidden = _has_small_vibrations(w, tolerances, state, memory[RATE])
         if not is_hidden:
             is_hidden = memory[RATE] > MIN_RATIO_TO_MOTION * _motion_rate(f, w, t, state, memory[RATE], Q, V, A)
-    # if a run is costly, a trial begins even if the largest rate is small: friction is stiff only while it reverses, and
-    # all estimates may fall outside these short times. As first steps are short, `counted` may be too large early in a
-    # run; therefore cost > min_cost is also required
+    # if a run is costly, a trial begins even if the largest rate is small: friction is stiff only while it reverses,
+    # and all estimates may fall outside these short times. As first steps are short, `counted` may be too large early
+    # in a run; therefore cost > min_cost is also required
     is_costly = is_cheap and cost > min_cost and counted > COST_OF_ANY_TRIAL * min_cost * (1.0 + memory[N_TRIALS])
     is_due = (
         h_rho > URGENT_RATIO or is_hidden or is_costly or (memory[N_ABOVE_LIMIT] >= options[N_ESTIMATES] and is_cheap)
     )
-    if is_cheap and h_rho <= 1.0:  # while a trial is not cheap, do not reset the count: it may start a trial later
+    if is_cheap and h_rho <= 1.0:  # as long as a trial is not cheap, keep this number, which may start a trial later
         memory[N_ABOVE_LIMIT] = 0.0
     is_expensive = cost_per_second > MIN_GAIN * memory[COST_PER_SECOND]  # compared with a second by the explicit method
     if (memory[PHASE] == EXPLICIT and is_due) or (memory[PHASE] == IMPLICIT and (h_rho < RETURN_BELOW or is_expensive)):

@@ -66,16 +66,16 @@ FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN, REACTION_BY_Q_GIVEN, MASS_VALUES_GIVEN = (
     GAMMA_REQUIRED,  # allowed error of Gamma by finite differences (evaluation/constraints.py), relative to GAMMA_SCALE
     GAMMA_STEP_RATIO,  # time step of finite differences for Gamma, relative to the result of `largest_difference_step`
     GAMMA_ACCURACY,  # error of Gamma, relative to GAMMA_SCALE, when GAMMA_STEP_RATIO was chosen last
-    GAMMA_SCALE,  # size to which errors of Gamma are compared: largest of all |Gamma_i| and sum_j |G_ij a_j| so far
-    REUSE,  # the inner loop keeps C_q and its factors if its last correction of positions was at most this
-    ROUNDED,  # rounding error of positions; at ends of steps, C_q is kept only after a correction of at most this size
+    GAMMA_SCALE,  # errors of Gamma are relative to this size: largest of all |Gamma_i| and sum_j |G_ij a_j| so far
+    REUSE,  # at stages, the inner loop evaluates C_q again only if its last correction of positions exceeds this
+    ROUNDED,  # rounding error of positions; at the ends of steps, this limit of corrections replaces REUSE
     GENERATION,  # number of partitions so far: a change of this number shows that the partition has changed
     RANK,  # rank of C_q, stored only if the workspace was allocated for another rank (code RANK_DIFFERS)
     RANK_V,  # rank of [C_q; A], stored together with RANK
     CONTRADICTION,  # with the code ROWS_CONTRADICT: index of a violated row of [C_q; A]
-    PIVOT,  # smallest pivot in the last elimination of C_q, rows scaled to maxima 1; fixed-order form: sqrt(SMALLEST)
-    # 1: a singular position has been near in this run, or short steps of this method trigger no checks. 2 (only in the
-    # fixed-order form): a singular position is near, and stages are projected. 0: neither 1 nor 2
+    PIVOT,  # smallest pivot in the last elimination of C_q with rows of maximum 1; fixed-order form: sqrt(SMALLEST)
+    # 0: very short steps trigger a check for a singular position. 1: they do not, because of the method, or because a
+    # singular position has been near. 2 (only in the fixed-order form): one is near now, and stages are projected
     NEARLY_SINGULAR,
     NEAR_NOW,  # 1: a singular position was near at the last check; 2: a check with a new partition is needed; 0: else
     MASS_SCALE,  # factor by which M is multiplied in the augmented matrix, see linalg/saddle_point.py

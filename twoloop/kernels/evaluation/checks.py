@@ -127,8 +127,8 @@ def linear_ranges(coordinates_in_units, radius, negligible, scratch, ranges):
 
 
 # flags that `evaluate_start` returns. WELL_FORMED: all values are finite, M is symmetric, no row of C_q or A is zero.
-# CONSISTENT: the state satisfies the constraints up to rounding. Only for a varying M, with L = roundings[2] max|M_ij|:
-# DEFINITE if all eigenvalues of M exceed L * EIGENVALUE_MARGIN; INDEFINITE if one is below L / EIGENVALUE_MARGIN
+# CONSISTENT: the state satisfies the constraints up to rounding. Only a varying M sets DEFINITE (all its eigenvalues
+# exceed L * EIGENVALUE_MARGIN, L = roundings[2] max|M_ij|) or INDEFINITE (one is below L / EIGENVALUE_MARGIN)
 WELL_FORMED, CONSISTENT, DEFINITE, INDEFINITE = 1, 2, 4, 8
 MAX_RELATIVE_DISTANCE = 0.5  # recorded sizes of coordinates are used at q if all |q_j - recorded q_j| <= this * size_j
 ROUNDING_OF_ZERO = 2.0**-52  # a coordinate up to this fraction of the largest one may be zero with a rounding error
@@ -205,7 +205,7 @@ def _has_same_entries(rows, entries):
 
 @exact
 def _index_of_near_position(q, rows, n_c, records):
-    """Return the index in `records` (see `evaluate_start`) of a position near q with the pattern of `rows`, or -1."""
+    """Return the index in `records` (see `evaluate_start`) of a position near q with nonzeros as in `rows`, or -1."""
     n = q.size
     stride = 2 * n + n_c * n
     for k in range(0, records.size, stride):
@@ -220,9 +220,9 @@ def _index_of_near_position(q, rows, n_c, records):
 def _is_consistent(C, rate, rows, q, v, records, tolerance):
     """Return True if (q, v) satisfies the constraints up to rounding errors; `rows`: [C_q; A], `rate`: C_t and b.
 
-    A violation is compared with the sum of |terms| of the constraint. In this sum, the largest of three numbers stands
-    for |q_j|: |q_j|, the size of q_j in `records` (see `evaluate_start`), the rounding error of the largest coordinate.
-    Otherwise constraints on coordinates normal to a plane of motion, zero up to rounding, would seem violated.
+    A violation is compared with the sum of |terms| of the constraint. In a term, |q_j| counts as at least the size of
+    q_j in `records` (see `evaluate_start`), and at least the rounding error of max|q|; |v_j| counts as max|v|. Otherwise
+    a coordinate normal to a plane of motion, zero except for rounding, would seem to violate a constraint.
     """
     fastest, rounding = largest_of(v), ROUNDING_OF_ZERO * largest_of(q)
     begin = _index_of_near_position(q, rows, C.size, records)

@@ -51,7 +51,7 @@ from twoloop.kernels.linalg.dense import copy
     N_ITERATED,  # number of coordinates on which accelerations depend; only these change in the fixed-point iteration
     N_ROWS,  # number of constraints
     FREE,  # the defect is also evaluated between nodes if step size > FREE * (longest time between evaluations)
-    MAY_REPEAT,  # 1: sweeps may evaluate accelerations twice; 0: once, as the second would recompute what depends on q
+    MAY_REPEAT,  # 1: sweeps may evaluate accelerations twice; 0: only once, as the second time would cost as much
     N_OPTIONS,
 ) = range(6)
 
@@ -76,8 +76,8 @@ GROWTH_ONE_SWEEP = 30.0  # largest ratio of step sizes early in a run, after a s
 MIN_FACTOR = 0.4  # smallest ratio of the next step size to the size of an accepted step
 LEAST_TREND = 0.4  # lower limit of `trend`: (size that a step's error allows) / (size that the previous error allowed)
 GAIN_BY_REPEATS = 1.5  # (step size that converges with two evaluations of accelerations per sweep) / (size with one)
-# sweeps stop evaluating accelerations twice (REPEATS = 0) if the convergence allows steps this many times as long as
-# the error estimate allows: the second evaluation then saves no time
+# sweeps no longer evaluate accelerations twice (REPEATS = 0) if (step size that convergence allows) / (step size that
+# the error estimate allows) exceeds this: second evaluations then save no time
 MAX_REACH = 2.5
 MAX_EXTRAPOLATION = 3.0  # upper limit of (step size that the error of a step allows) / (size of this step)
 _array_offsets = merged(array_offsets)
@@ -153,7 +153,7 @@ def _solve_collocation(f, w, options, data, tolerances, t, h, state):
         max_factor = min(max_factor, factor_by_defect)
     max_factor = min(max_factor, h_max / h)
     extra_sweeps = data[field.SWEEPS] - data[field.N_TARGET]
-    # the motion may be stiff if accelerations hardly vary, although a step took at least (target number) - 1 sweeps
+    # the motion may be stiff if accelerations hardly vary, but the number of sweeps is at least its target value - 1
     is_limited = data[field.CURVATURE] < MIN_CURVATURE and extra_sweeps >= -1.0
     data[field.LIMITED] = max(0.0, data[field.LIMITED] + (1.0 if is_limited else -1.0))
     # `trend`: (size that this step's error allows) / (size that the previous step's error allowed). A trend below 1
@@ -313,7 +313,7 @@ def _adopt_projection(f, w, options, data, tolerances, driven, n, k, t, row, sta
 
 @merged
 def _can_take_next_step(w, data, tolerances, control, clock, h):
-    """Return False if the integrator must act before the next step: its size h is too small, or the method unsuited."""
+    """Return False if the integrator must act before the next step: if h is too small, or the method must change."""
     h_long = clock[at.H_LONG]
     if h <= control[at.SHORTEST] or h < COLLAPSED_STEP * h_long or _must_change_method(w, data, tolerances):
         return False
@@ -357,7 +357,7 @@ def _take_steps(f, w, options, data, tolerances, control, clock, goal, state, n_
 def lobatto_steps(
     f, w, options, memory, tolerances, control, clock, goal, state, new_state, out_t, out_state, out_steps
 ):
-    """Take at most LANES steps in a row, and project their ends together; return the number of accepted steps.
+    """Take at most LANES successive steps, and project their ends together; return the number of accepted steps.
 
     The last step is the one that makes the run's number of accepted steps a multiple of LANES. So results do not depend
     on where the integrator pauses, for example to look for Ctrl-C: the same steps are always projected together.
