@@ -421,7 +421,7 @@ class LaneSeries:
     ) -> None:
         """Write code for Taylor coefficient k = `order` > 0 of the results of `operations`; `inverse`: 1 / k.
 
-        The second factor of a PENDING product contains v, lam or a: its coefficient k is not known yet, and left out.
+        The second factor of a PENDING product contains v, lam or a: its yet unknown coefficient k is left out.
         """
         pairs = list(dict.fromkeys(pair for operation in operations for pair in self._factors(operation)))
         sums = {}

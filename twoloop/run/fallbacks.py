@@ -235,7 +235,7 @@ def renew_kit(run: Run) -> None:
 def cross_singularity(run: Run, past: list[TimedState]) -> tuple[Plan, Array]:
     """Prepare steps across a singular position, see kernels/steps/crossing_step.py; return their plan and settings.
 
-    Set the first step size, and store the polynomials to try as `run.origins`. The settings are the array `control`
+    Set the first step size, and store in `run.origins` which polynomials to try. The settings are the array `control`
     that `advance` reads. `past`: states of the last accepted steps, oldest first; may be empty.
     """
     a, clock = run.a, run.clock

@@ -62,7 +62,7 @@ class Options:
             run.set_step_sizes(self.first_step, self.max_step, t1)
 
 
-NO_CALL: Any = (None,) * 12, None  # takes the place of (12 arguments, options) of the last call before there is a call
+NO_CALL: Any = (None,) * 12, None  # stands for (12 arguments, options) of the last call if there was no call yet
 
 
 def options_of(
@@ -120,7 +120,7 @@ def options_of(
         check_positive("time_limit", time_limit)
     step_options = first_step, float(max_step), max_steps, step_size
     options = Options(method_object, float(rtol), tolerances, *step_options, generates, bool(check_derivatives))
-    if type(atol) is float and is_preset(method):  # arrays and users' method objects may change between calls
+    if type(atol) is float and is_preset(method):  # unlike arrays, these cannot change between calls
         arguments = method, rtol, atol, first_step, max_step, max_steps, step_size, dense_output, progress
         system.shared["options"] = (*arguments, time_limit, check_derivatives, compiled), options
     return options

@@ -84,7 +84,7 @@ class SignalHandlers:
 
 
 def signals_of(system: ConstrainedSystem) -> SignalHandlers:
-    """Return a context manager. If its block catches an exception of a signal handler, raise the exception again."""
+    """Return a context manager that raises exceptions of signal handlers again, even if its block catches them."""
     return SignalHandlers(ctrl_c=system.called_in_python)
 
 

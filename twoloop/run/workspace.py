@@ -380,7 +380,7 @@ def kit_for_plan(system: ConstrainedSystem, flags: Array, plan: Plan | None) -> 
 
 
 def _steps_of_plan(plan: Plan) -> tuple[Any, Any, Any]:
-    """Return a plan's Step and the Steps of its pair (None: no pair; PLACEHOLDER_STEP: its second is not imported)."""
+    """Return a plan's Step and the Steps of its pair (None: no pair; PLACEHOLDER_STEP: second not imported yet)."""
     return load_step(plan.step), load_step(plan.first), step_if_loaded(plan.second)
 
 

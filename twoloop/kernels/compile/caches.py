@@ -158,7 +158,7 @@ _warnings: list[str] = []  # the warning that `_warn_first` has printed; empty i
 
 
 def _warn_first(text: str) -> None:
-    """Print a warning on stderr that other users can write code files; in a process, only the first call prints."""
+    """Warn on stderr about code that other users can write; only the first call in a process prints its text."""
     if not _warnings:
         _warnings.append(text)
         print(text, file=sys.stderr, flush=True)

@@ -160,8 +160,8 @@ def store_prediction(w, q1):
 def prediction_error(w, tolerances, h, q, v, q1):
     """Return the largest |w.predicted - q1| (dependent positions) / (allowed error), for a step from (q, v) to q1.
 
-    The formula predicted w.predicted; q1 satisfies C = 0. The allowed error is the tolerance or, if smaller, about
-    this fraction of the largest displacement: FRACTION_OF_MOTION; FRACTION_AT_SIGN_CHANGE if det C_qd changes sign.
+    The formula predicted w.predicted; q1 satisfies C = 0. The allowed error is the tolerance or, if smaller, about a
+    fraction of the largest displacement: FRACTION_OF_MOTION, or FRACTION_AT_SIGN_CHANGE if det C_qd changes sign.
     w.orientation_new becomes the sign of det C_qd, from its factors in `w`. If steps have a fixed size, only return 0.
     """
     if tolerances[ESTIMATE] == 0.0:

@@ -61,7 +61,7 @@ URGENT_RATIO = 3.0  # a trial is urgent (cost cannot delay it) if step size * la
 # (see URGENT_RATIO) also waits until the run has cost this number of evaluations per independent coordinate
 MIN_COST_PER_COORDINATE = 64.0
 TRIAL_COST = 300.0  # approximate cost of a trial of the implicit method, in evaluations of the implicit method
-MIN_COST_IN_TRIALS = 3.0  # unless urgent, a trial waits until (cost of the run) / (cost of a trial) exceeds this
+MIN_COST_IN_TRIALS = 3.0  # unless urgent (URGENT_RATIO), a trial waits until cost of the run / cost of a trial > this
 COUNTED_FRACTION_OF_RUN = 0.3  # when a trial is considered, a run's cost counts as at least this * its expected total
 # however small the largest rate is, a first trial begins when the run has cost as much as
 # COST_OF_ANY_TRIAL * MIN_COST_IN_TRIALS trials. After k trials, the next one begins at k + 1 times this cost
@@ -338,9 +338,9 @@ def _phase_to_begin(f, w, options, memory, tolerances, t, state, new_state):
     is_due = (
         h_rho > URGENT_RATIO or is_hidden or is_costly or (memory[N_ABOVE_LIMIT] >= options[N_ESTIMATES] and is_cheap)
     )
-    if is_cheap and h_rho <= 1.0:  # as long as a trial is not cheap, keep this number, which may start a trial later
+    if is_cheap and h_rho <= 1.0:  # as long as a trial is not cheap, keep N_ABOVE_LIMIT, which may start a trial later
         memory[N_ABOVE_LIMIT] = 0.0
-    is_expensive = cost_per_second > MIN_GAIN * memory[COST_PER_SECOND]  # compared with a second by the explicit method
+    is_expensive = cost_per_second > MIN_GAIN * memory[COST_PER_SECOND]  # compared with the explicit method
     if (memory[PHASE] == EXPLICIT and is_due) or (memory[PHASE] == IMPLICIT and (h_rho < RETURN_BELOW or is_expensive)):
         memory[COST_PER_SECOND] = cost_per_second
         memory[N_TRIALS] += 1.0

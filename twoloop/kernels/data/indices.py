@@ -68,12 +68,12 @@ FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN, REACTION_BY_Q_GIVEN, MASS_VALUES_GIVEN = (
     GAMMA_ACCURACY,  # error of Gamma, relative to GAMMA_SCALE, when GAMMA_STEP_RATIO was chosen last
     GAMMA_SCALE,  # errors of Gamma are relative to this size: largest of all |Gamma_i| and sum_j |G_ij a_j| so far
     REUSE,  # at stages, the inner loop evaluates C_q again only if its last correction of positions exceeds this
-    ROUNDED,  # rounding error of positions; at the ends of steps, this limit of corrections replaces REUSE
+    ROUNDED,  # rounding error of positions; it replaces the limit REUSE at the ends of steps
     GENERATION,  # number of partitions so far: a change of this number shows that the partition has changed
     RANK,  # rank of C_q, stored only if the workspace was allocated for another rank (code RANK_DIFFERS)
     RANK_V,  # rank of [C_q; A], stored together with RANK
     CONTRADICTION,  # with the code ROWS_CONTRADICT: index of a violated row of [C_q; A]
-    PIVOT,  # smallest pivot in the last elimination of C_q with rows of maximum 1; fixed-order form: sqrt(SMALLEST)
+    PIVOT,  # smallest pivot of the last elimination of C_q (rows scaled to maximum 1); fixed-order form: sqrt(SMALLEST)
     # 0: very short steps trigger a check for a singular position. 1: they do not, because of the method, or because a
     # singular position has been near. 2 (only in the fixed-order form): one is near now, and stages are projected
     NEARLY_SINGULAR,

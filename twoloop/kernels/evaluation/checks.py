@@ -221,8 +221,8 @@ def _is_consistent(C, rate, rows, q, v, records, tolerance):
     """Return True if (q, v) satisfies the constraints up to rounding errors; `rows`: [C_q; A], `rate`: C_t and b.
 
     A violation is compared with the sum of |terms| of the constraint. In a term, |q_j| counts as at least the size of
-    q_j in `records` (see `evaluate_start`), and at least the rounding error of max|q|; |v_j| counts as max|v|. Otherwise
-    a coordinate normal to a plane of motion, zero except for rounding, would seem to violate a constraint.
+    q_j in `records` (see `evaluate_start`), and at least the rounding error of max|q|; |v_j| counts as max|v|. Else a
+    coordinate normal to a plane of motion, zero except for rounding, would seem to violate a constraint.
     """
     fastest, rounding = largest_of(v), ROUNDING_OF_ZERO * largest_of(q)
     begin = _index_of_near_position(q, rows, C.size, records)

@@ -17,7 +17,7 @@ ROWS_SEARCHED = 4  # to save time, pivot blocks are sought only in the ROWS_SEAR
 # - MIN_SINE_SQUARES: smallest squared sine of the angle between the columns of two pivots; for a single pivot, smallest
 #   squared ratio of the pivot to the norm of its column of G
 # With the first pair, pivots stay large for 98 % of a turn of a spatial four-bar, with the second for 34 %. Generated
-# code fails if a squared sine falls below MIN_PIVOT_SQUARE (generate/null_space.py): even the last limit is above it
+# code fails if a squared sine falls below MIN_PIVOT_SQUARE (generate/null_space.py): even the loosest limit is above it
 MAX_SQUARES, MIN_SINE_SQUARES = (4.0, 20.0, 200.0), (0.2**2, 0.1**2, 0.04**2)
 MIN_CONSTANT_PIVOT = 1e-3  # smallest constant that may be a pivot, relative to the largest entry of its row
 CANCELLATION = 1e-12  # in an elimination, the difference a - b of constants counts as zero up to this fraction of |b|
