@@ -221,6 +221,23 @@ def test_the_freedom_of_large_models_is_that_by_full_matrices(made, monkeypatch)
     assert made().bodies.freedom == found
 
 
+def test_velocities_of_light_bodies_tied_to_a_heavy_one_have_least_energy():
+    points, masses = np.array([(0.0, 0.0), (1.0, 0.0), (2.0, 0.5), (2.2, -0.3)]), (1e-6, 1e6, 1e-6)
+    model = PlanarModel(gravity=(0.0, 0.0))
+    for k, mass in enumerate(masses):
+        velocity = {"velocity": (0.0, 1.5)} if k == 0 else {}
+        model.body(str(k), mass=mass, inertia=0.1 * mass, position=points[k : k + 2].mean(axis=0), **velocity)
+        model.revolute(str(k - 1) if k else "ground", str(k), at=points[k])
+    rates = model.problem((0.0, 1.0)).v0[2::3]
+    pin = np.zeros(2)  # velocity of the pin at the start of a rod
+    for k, expected in enumerate((3.0, None, None)):
+        x, y = r = np.diff(points, axis=0)[k] / 2.0
+        # as the mass of the next rod is 1e-12 times as large or its motion is given, each rod turns for itself
+        rate = expected or -np.dot((-y, x), pin) / (0.1 + r @ r)
+        assert rates[k] == pytest.approx(rate, rel=1e-9)
+        pin = pin + rate * 2.0 * np.array((-y, x))
+
+
 def test_velocities_of_light_bodies_do_not_depend_on_a_heavy_one_beside_them():
     def start(heavy):
         model = PlanarModel()

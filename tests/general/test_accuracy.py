@@ -7,6 +7,7 @@ from tests.general.mechanisms import REDUNDANT, REGULAR, mechanism, relative_err
 from tests.mechanisms.make_references import solution
 from tests.problems import pendulum, worst
 from twoloop import solve_dae
+from twoloop.bodies import PlanarModel
 
 METHODS = ("DOP853", "Gauss12", "Adams")
 DIGITS = {"Adams": 1e-8}  # its errors are up to a hundred times the tolerance
@@ -74,3 +75,21 @@ def swing(size, time, method, rtol):
 def test_errors_in_tolerances_do_not_depend_on_units(method, size, time):
     rtol = 1e-11 if method in ("Lobatto16", "Gauss12", "RadauIIA9") else 1e-6
     assert worst(swing(size, time, method, rtol), swing(1.0, 1.0, "DOP853", 1e-12)) < 60.0 * rtol
+
+
+def test_a_stiff_model_in_millimetres_takes_about_as_many_evaluations_as_in_metres():
+    ends, counts = [], []
+    for size in (1.0, 1e3):
+        model = PlanarModel(gravity=(0.0, -9.81 * size))
+        for k in range(2):
+            model.rod(str(k), (k * size, 0.0), ((k + 1) * size, 0.0), mass=1.0)
+            pin = model.revolute(str(k - 1) if k else "ground", str(k), at=(k * size, 0.0))
+        model.torsion_spring(pin, stiffness=2e4 * size**2, damping=1e3 * size**2)
+        p, units = model.problem((0.0, 1.0)), np.tile([size, size, 1.0], 2)
+        options = {"rtol": 1e-8, "atol": 1e-8 * units, "compiled": False, "time_limit": 20.0}
+        result = solve_dae(p.system, p.t_span, p.q0, p.v0, **options)
+        assert result.success and "rank" not in result.message, result.message
+        ends.append(result.q[:, -1] / units)
+        counts.append(result.stats.n_evaluations)
+    np.testing.assert_allclose(*ends, rtol=0.0, atol=1e-6)
+    assert counts[1] < 3 * counts[0]

@@ -17,6 +17,7 @@ from twoloop.checks.scales import TURNS, generic_factors, scales_of, typical_siz
 from twoloop.checks.sparse_rows import SparseRows, norms
 from twoloop.problem.description import name_and_unit
 from twoloop.problem.system import ConstrainedSystem
+from twoloop.run.fallbacks import velocity_changes
 from twoloop.run.projection import consistent_state, dependence, project_sparsely
 
 SINGULAR = 1e-9  # singular values of the scaled Jacobian below this fraction of the largest count as zero
@@ -105,16 +106,15 @@ def velocities(
         )
     free = null_space(scaled, rcond=SINGULAR)
     target = np.where(is_given, given, 0.0) / scales.columns
-    mass = system.mass(t, q) * np.outer(scales.columns, scales.columns)
     size = float(np.abs(target).max(initial=0.0))
     if free.shape[1] and is_given.any():
         block = free[is_given]
         v = v + free @ np.linalg.lstsq(block, (target - v)[is_given], rcond=SINGULAR)[0]
         free = free @ null_space(block, rcond=SINGULAR)
     if free.shape[1]:
-        free[np.abs(free) < ROUNDING] = 0.0  # the inertia of heavy bodies would multiply rounding errors
-        inert = free.T @ mass @ free
-        v = v - free @ np.linalg.lstsq(inert, free.T @ (mass @ v), rcond=SINGULAR)[0]
+        mass, held = system.mass(t, q), np.vstack([rows, np.eye(system.n_q)[is_given]])
+        impulses = -mass @ (v * scales.columns)
+        v = v + velocity_changes(mass, held, impulses[:, None], np.zeros((len(held), 1)))[:, 0] / scales.columns
     off = np.where(is_given, np.abs(v - target), 0.0)
     if off.max(initial=0.0) > max(VELOCITY_CHANGE * size, SINGULAR * speed):
         j = int(off.argmax())

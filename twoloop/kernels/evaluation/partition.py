@@ -36,6 +36,7 @@ from twoloop.kernels.linalg.markowitz_lu import (
     solve_rows,
 )
 
+LARGE_COLUMN = 16.0  # columns of the constraint Jacobian with larger entries are scaled when pivots are chosen
 RANK_TOLERANCE = 1e-11  # a pivot, or the ratio of the smallest to the largest pivot, counts as zero up to this limit
 PARTITION_CHANGED = -1  # return code: the task succeeded, as for DONE, and the partition has changed
 MAX_ROWS_ELIMINATED = 200  # with more independent rows than this, `min_pivot_ratio` returns w.pivot to save time
@@ -51,6 +52,23 @@ def scale_rows(A):
         if largest > 0.0 and largest < np.inf:
             scale = 2.0 ** -np.round(np.log2(largest))
             for j in range(A.shape[1]):
+                A[i, j] *= scale
+
+
+@compiled
+def scale_large_columns(A):
+    """Scale columns of A in place by powers of two, where their largest entry exceeds LARGE_COLUMN; it becomes about 1.
+
+    Otherwise columns of angles would yield pivots only because lengths are in mm. Columns of small entries are not
+    scaled, as entries become small near singular positions.
+    """
+    for j in range(A.shape[1]):
+        largest = 0.0
+        for i in range(A.shape[0]):
+            largest = max(largest, abs(A[i, j]))
+        if largest > LARGE_COLUMN and largest < np.inf:
+            scale = 2.0 ** -np.round(np.log2(largest))
+            for i in range(A.shape[0]):
                 A[i, j] *= scale
 
 
@@ -120,6 +138,7 @@ def min_pivot_ratio(f, w, t, q):
     G = w.Gx
     G[:, :] = 0.0
     constraint_rows(f, w, t, q, G)
+    scale_large_columns(G)
     rank = _pivot_rows(w, w.Rate.size, w.rows_v.size)
     if rank < w.rows_v.size:
         return 0.0
@@ -148,6 +167,7 @@ def _find_pivot_order(w, max_rank, max_rank_v):
     """
     G, order, row_order = w.Gx, w.order, w.row_order
     n_c, n_rows = w.C.size, w.Rate.size
+    scale_large_columns(G)
     scale_rows(G)
     rank = _pivot_rows(w, n_c, max_rank)
     w.pivot = abs(G[rank - 1, rank - 1]) if rank > 0 else 1.0
@@ -170,6 +190,7 @@ def smallest_pivot(f, w, t, q):
         return 1.0
     w.Gx[:, :] = 0.0
     constraint_rows(f, w, t, q, w.Gx)
+    scale_large_columns(w.Gx)
     scale_rows(w.Gx)
     return abs(w.Gx[rank - 1, rank - 1]) if _pivot_rows(w, w.C.size, rank) == rank else 0.0
 
