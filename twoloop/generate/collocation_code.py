@@ -314,17 +314,17 @@ class CollocationCode:
         """
         builder, num, n = emit.builder, Emitter(emit.builder), self.n
         has_fixed_size = builder.compare("fcmp oeq", num.load(tolerances, ESTIMATE), llvm_code.ZERO)
-        h, given_rtol = num.load(work, mem.H), num.load(tolerances, RTOL)
-        rtol = builder.select(has_fixed_size, llvm_code.ONE, given_rtol)
+        h, own_rtol = num.load(work, mem.H), num.load(tolerances, RTOL)
+        rtol = builder.select(has_fixed_size, llvm_code.ONE, own_rtol)
         wide, begins = self._vector_emitter(emit)
         zero = wide.constant(0.0)
-        length, half, relative, given = (wide.broadcast(each) for each in (h, h * 0.5, rtol, given_rtol))
+        length, half, relative, divisor = (wide.broadcast(each) for each in (h, h * 0.5, rtol, own_rtol))
         largest = [zero] * 3
         for begin in begins:
             q, v, a = (abs(wide.load(num.pointer(state, m * n + begin))) for m in range(3))
             sizes = wide.maximum(q, half * v), wide.maximum(v, half * a)
             atol = wide.load(num.pointer(tolerances, ATOL + begin))
-            atol = builder.select(has_fixed_size, wide.minimum(atol / given, wide.constant(1.0)), atol)
+            atol = builder.select(has_fixed_size, wide.minimum(atol / divisor, wide.constant(1.0)), atol)
             of_q, of_v = (wide.fma(relative, each, atol) for each in sizes)
             is_v_stricter = of_v * length < of_q
             allowed = wide.maximum(builder.select(is_v_stricter, of_v, of_q), wide.constant(MIN_DIVISOR))

@@ -409,27 +409,34 @@ TINY = 1e-300  # smallest result of `smallest_size`, which avoids divisions by z
 
 
 @merged
-def smallest_size(tolerances):
+def smallest_size(rtol, atol):
     """Return the lower limit of typical sizes of q and v: the smallest atol / rtol of all coordinates, at most 1."""
     size = 1.0
-    if tolerances[RTOL] > 0.0:
-        for k in range(ATOL, tolerances.size):
-            size = min(size, tolerances[k] / tolerances[RTOL])
+    if rtol > 0.0:
+        for each in atol:
+            size = min(size, each / rtol)
     return max(size, TINY)
 
 
 @merged
+def limited_size(largest, least):
+    """Return the norm `largest`, clipped to [`least`, 1]; 1 if both arguments are 0. `least`: see `smallest_size`."""
+    size = min(max(least, largest), 1.0)
+    return size if size > TINY else 1.0
+
+
+@merged
 def typical_size(tolerances, x):
-    """Return the typical size of x (q or v): max|x_k|, clipped to [`smallest_size`, 1]; 1 if x = 0 and any atol_k = 0.
+    """Return the typical size of x (q or v): max|x_k|, limited by `limited_size`.
 
     Smaller components count as this size. If it were 1 for a mechanism of 1e-9 m, finite differences would displace q
     by 1e-7 m, and a correction of 1e-14 m would count as rounding. As x may be rounding errors, such as velocities at
     rest, the size is at least `smallest_size`: below it, absolute tolerances exceed relative ones.
     """
-    size = smallest_size(tolerances)
-    for k in range(x.size):
-        size = min(max(size, abs(x[k])), 1.0)
-    return size if size > TINY else 1.0
+    largest = 0.0
+    for each in x:
+        largest = max(largest, abs(each))
+    return limited_size(largest, smallest_size(tolerances[RTOL], tolerances[ATOL:]))
 
 
 @merged

@@ -11,7 +11,7 @@ are computed anew, by finite differences. Offsets and names in capitals belong t
 
 import numpy as np
 
-from twoloop.kernels.data.common import TINY, compiled, kernel, max_change_by_rounding, merged
+from twoloop.kernels.data.common import compiled, kernel, limited_size, max_change_by_rounding, merged, smallest_size
 from twoloop.kernels.lanes import layout as at
 from twoloop.kernels.lanes.control import LEAST, N_HEAD, begin_control, choose_steps, end_steps, judge_steps, set_end
 from twoloop.kernels.lanes.layout import (
@@ -28,7 +28,7 @@ from twoloop.kernels.lanes.layout import (
     vector_range,
 )
 from twoloop.kernels.linalg.dense import sum_rows
-from twoloop.kernels.steps.newton_systems import MAX_ITERATIONS, MAX_ROUNDING_CORRECTION, RELATIVE_DISPLACEMENT
+from twoloop.kernels.steps.newton_systems import MAX_ITERATIONS, MAX_ROUNDING_CORRECTION, displaced
 from twoloop.kernels.steps.stages import (
     GAMMA0,
     MAX_STEP_RATIO,
@@ -144,12 +144,7 @@ def _evaluate_middle_state(code, settings, control, c, work, new, a, memory):
 
 @merged
 def _smallest_size(control, n):
-    """Return the smallest of 1 and all atol / rtol: the least size that is assumed for positions and velocities."""
-    size = 1.0
-    if control[at.RTOL] > 0.0:
-        for j in range(n):
-            size = min(size, control[at.ATOL + j] / control[at.RTOL])
-    return max(size, TINY)
+    return smallest_size(control[at.RTOL], control[at.ATOL : at.ATOL + n])
 
 
 @merged
@@ -157,11 +152,10 @@ def _store_typical_size(control, work, n, vector):
     """Store in DISPLACED the typical size of q or v (at offset `vector`), for displacements in finite differences."""
     least = _smallest_size(control, n)
     for k in range(LANES):
-        size, largest = least, 0.0
+        largest = 0.0
         for j in range(n):
             largest = max(largest, abs(work[(vector + j) * LANES + k]))
-        size = min(max(size, largest), 1.0)
-        work[at.DISPLACED * LANES + k] = size if size > TINY else 1.0
+        work[at.DISPLACED * LANES + k] = limited_size(largest, least)
         work[at.LARGEST * LANES + k] = largest
 
 
@@ -182,11 +176,8 @@ def compute_derivatives(code, settings, control, c, work):
         copy_vectors(work, middle, new, 2 * n)
         for k in range(LANES):
             index = (new + column) * LANES + k
-            size = max(work[at.DISPLACED * LANES + k], abs(work[index]))
-            if control[at.RTOL] > 0.0:
-                natural_size = control[at.ATOL + column % n] / control[at.RTOL]
-                size = max(size, min(work[at.LARGEST * LANES + k], natural_size))
-            work[index] += RELATIVE_DISPLACEMENT * size
+            sizes = work[at.DISPLACED * LANES + k], work[at.LARGEST * LANES + k]
+            work[index] = displaced(work[index], *sizes, control[at.RTOL], control[at.ATOL + column % n])
         code.compute_accelerations(order, control, work)
         matrix = matrix_offset(memory, n, s, DERIVATIVE_Q if column < n else DERIVATIVE_V) + column % n
         for k in range(LANES):

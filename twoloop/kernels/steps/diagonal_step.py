@@ -36,7 +36,7 @@ from twoloop.kernels.data.common import (
     merged,
     smallest_size,
 )
-from twoloop.kernels.data.indices import DONE, ESTIMATE, FIXED_ORDER, OUTER_DIVERGED, SINGULAR
+from twoloop.kernels.data.indices import ATOL, DONE, ESTIMATE, FIXED_ORDER, OUTER_DIVERGED, RTOL, SINGULAR
 from twoloop.kernels.evaluation.inner_loop import evaluate, evaluate_state, find_tangents, multipliers
 from twoloop.kernels.linalg.dense import copy, ldl_factor, ldl_solve, lu_factor, lu_solve
 from twoloop.kernels.steps import stages as at
@@ -251,7 +251,7 @@ def solve_stage(f, w, options, tolerances, memory, t, h, A_stage):
     residual = block(memory, 1, n, at.RESIDUAL)
     a = A_stage[0]
     has_tangents = f.force_by_q_given == 1
-    last_change, least_size = 0.0, smallest_size(tolerances)
+    last_change, least_size = 0.0, smallest_size(tolerances[RTOL], tolerances[ATOL:])
     for iteration in range(MAX_ITERATIONS):
         w.n_outer += 1
         for m in range(n):

@@ -26,7 +26,7 @@ from twoloop.kernels.data.common import (
     max_change_by_rounding,
     smallest_size,
 )
-from twoloop.kernels.data.indices import DONE, ESTIMATE, FIXED_ORDER, LEAST, OUTER_DIVERGED
+from twoloop.kernels.data.indices import ATOL, DONE, ESTIMATE, FIXED_ORDER, LEAST, OUTER_DIVERGED, RTOL
 from twoloop.kernels.evaluation.inner_loop import accelerations, evaluate, multipliers
 from twoloop.kernels.linalg.dense import copy
 from twoloop.kernels.steps import stages as at
@@ -73,7 +73,7 @@ def _solve_stages(f, w, options, memory, t, h, tolerances, q, v, A_stage):
     Q_stage, V_stage = block(memory, s, n, at.Q_STAGE), block(memory, s, n, at.V_STAGE)
     a_new = vector(memory, s, n, at.A_NEW)
     previous_change = 0.0
-    max_rounding, least_size = MAX_ROUNDING_CORRECTION_FIXED, smallest_size(tolerances)
+    max_rounding, least_size = MAX_ROUNDING_CORRECTION_FIXED, smallest_size(tolerances[RTOL], tolerances[ATOL:])
     if tolerances[ESTIMATE] == 1.0:
         max_rounding = MAX_ROUNDING_CORRECTION * tolerances[LEAST]
     rounding_limit = 0.0

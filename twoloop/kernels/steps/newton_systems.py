@@ -31,7 +31,7 @@ There are three kinds of storage:
 
 import numpy as np
 
-from twoloop.kernels.data.common import compiled, finite_vector, inlined, typical_size
+from twoloop.kernels.data.common import compiled, finite_vector, inlined, merged, typical_size
 from twoloop.kernels.data.indices import ATOL, DONE, FIXED_ORDER, NEEDS_DENSE, NOT_FINITE, RTOL, SINGULAR
 from twoloop.kernels.evaluation.constraints import constraint_rows
 from twoloop.kernels.evaluation.inner_loop import evaluate, find_tangents
@@ -92,17 +92,23 @@ def _displacement_sizes(tolerances, x):
     return typical_size(tolerances, x), largest_of(x)
 
 
+@merged
+def displaced(x, typical_size, largest, rtol, atol):
+    """Return x, a coordinate or velocity, plus a displacement for finite differences.
+
+    It is RELATIVE_DISPLACEMENT * max(|x|, typical_size, min(largest, atol / rtol)); `largest` is the largest coordinate
+    or velocity. Without the last of these sizes, the displacement would be a rounding error where x is zero, but
+    others are large.
+    """
+    size = max(typical_size, abs(x))
+    if rtol > 0.0:
+        size = max(size, min(largest, atol / rtol))
+    return x + RELATIVE_DISPLACEMENT * size
+
+
 @inlined
 def _displaced(tolerances, x, sizes, j):
-    """Return x_j plus a displacement for finite differences.
-
-    It is RELATIVE_DISPLACEMENT * max(|x_j|, typical size, min(max|x|, atol_j / rtol)). Without the last of these three
-    sizes, the displacement would be a rounding error where x_j is zero, but other numbers in x are large.
-    """
-    size = max(sizes[0], abs(x[j]))
-    if tolerances[RTOL] > 0.0:
-        size = max(size, min(sizes[1], tolerances[ATOL + j] / tolerances[RTOL]))
-    return x[j] + RELATIVE_DISPLACEMENT * size
+    return displaced(x[j], sizes[0], sizes[1], tolerances[RTOL], tolerances[ATOL + j])
 
 
 @inlined
