@@ -95,8 +95,9 @@ class LaneEmitter(Emitter):
         return self.builder.select(self.builder.compare("fcmp ult", a, b), a, b)
 
     def maximum_or_nan(self, a: Value, b: Value) -> Value:
-        """Return the larger one of a and b, or a if one of them is NaN. So the result is NaN only if a is NaN."""
-        return self.builder.select(self.builder.compare("fcmp ugt", a, b), a, b)
+        """Return the larger one of a and b, or NaN if one of them is NaN."""
+        larger = self.builder.select(self.builder.compare("fcmp ugt", a, b), a, b)
+        return self.builder.select(self.builder.compare("fcmp uno", b, b), b, larger)
 
 
 def load_lanes(emit: LaneEmitter, base: Value, index: int = 0) -> Value:

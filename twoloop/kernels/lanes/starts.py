@@ -265,11 +265,12 @@ _memory_offsets = merged(offsets_in_memory)
 
 @merged
 def _largest_value(work, offset, count, k):
-    """Return the largest |value| in lane k of `count` vectors from `offset` on; values before a NaN do not count."""
+    """Return the largest |value| in lane k of `count` vectors from `offset` on, or NaN if a value is NaN."""
     largest = 0.0
     for j in range(count):
         magnitude = abs(work[(offset + j) * LANES + k])
-        largest = largest if magnitude <= largest else magnitude  # the next number replaces a NaN in `largest`
+        if magnitude > largest or np.isnan(magnitude):
+            largest = magnitude
     return largest
 
 
