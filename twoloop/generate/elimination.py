@@ -369,7 +369,7 @@ class Elimination:
         return matrix
 
     def _solve(self, r: Sequence[Affine], c: Sequence[Affine]) -> tuple[list[Affine], list[tuple[Affine, Affine]]]:
-        """Solve M a + G^T lam = r, G a = c (all rows); return [a, lam] (lam: independent rows), validity conditions."""
+        """Solve M a + G^T lam = r, G a = c; return [a, lam] (lam: of independent rows), and conditions, see Program."""
         return solve_refined(self.factors.solve, self.choice, self.mass, self.all_rows, r, c)
 
     def _right_sides(self, v: Sequence[Affine]) -> tuple[list[Affine], list[Affine]]:
@@ -432,13 +432,13 @@ class Elimination:
 
     @cached_property
     def position_errors(self) -> Program:
-        """Return the program for "c" in C_q (change of q) = c; c is -C, or 0 in redundant and non-holonomic rows."""
+        """Return the program for "c" in C_q (change of q) = c: -C, or 0 in redundant and non-holonomic rows."""
         errors = [*(-violation for violation in self._callback_terms("constraint")), *[self.zero] * self.system.n_a]
         return Program(self.graph, {"c": self._expand_to_all_rows([errors[k] for k in self.choice.rows])})
 
     @cached_property
     def velocity_errors(self) -> Program:
-        """Return the program for "c" in G (change of v) = c; c: -(C_q v + C_t), -(A v + b), or 0 in redundant rows."""
+        """Return the program for "c" in G (change of v) = c: -(C_q v + C_t) and -(A v + b), or 0 in redundant rows."""
         errors = []
         for row, rate in zip(self.rows, self.rates, strict=True):
             total = rate

@@ -496,12 +496,12 @@ class _PartialSums(NamedTuple):
     row_before: _Row  # memory that contains coefficient k - 1 of all series
 
     def sum_of_order(self, pair: tuple[int, int]) -> Value:
-        """Return the sum of X[j] Y[k - j] over 0 < j < k; `pair`: indices of the series X and Y in rows."""
+        """Return the sum of X[j] Y[k - j] over 0 < j < k (k: order); `pair`: indices of series X and Y in a `_Row`."""
         emit, (x, y) = self.row_before.emit, pair
         return self.sums[pair, False] + emit.load(self.first_row, x) * self.row_before.load(y)
 
     def sum_of_next_order(self, pair: tuple[int, int], row: _Row) -> Value:
-        """Return the sum of X[j] Y[k + 1 - j] over 0 < j <= k; `pair`: indices of X and Y; `row` stores X[k], Y[k]."""
+        """Return the sum of X[j] Y[k + 1 - j] over 0 < j <= k; `pair`: indices of X, Y in `row` (with X[k], Y[k])."""
         emit, (x, y) = self.row_before.emit, pair
         total = self.sums[pair, True] + row.load(x) * emit.load(self.first_row, y)
         return total + emit.load(self.row_1, x) * row.load(y)

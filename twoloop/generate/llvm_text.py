@@ -201,7 +201,7 @@ class Builder:
         self.arguments = [Value(kind, f"%a{k}", self) for k, kind in enumerate(arguments)]
         self._n_values = self._n_allocated = 0
         self._far_pointer: Value | None = None
-        self.part = 0  # index of the current part of the function: number of times that a block has been split
+        self.part = 0  # index of the current part of the function: number of calls of `_split_block` so far
         self._blocks: list[Block] = []
         self._n_blocks = 0
         self.position_at_end(self.append_block())

@@ -115,7 +115,7 @@ class Program:
 
     @property
     def expressions(self) -> list[Affine]:
-        """Return the list of all expressions in arrays and conditions."""
+        """Return the list of all expressions in the program's arrays and conditions."""
         exprs = [expr for array in self.arrays.values() for expr in array]
         return [*exprs, *(expr for condition in self.conditions for expr in condition)]
 
@@ -284,7 +284,7 @@ class Coefficients:
         return self._formulas
 
     def indexed_terms(self, terms: Terms, constant: float = 0.0) -> tuple[Terms, float]:
-        """Return terms and a constant, with each number replaced by a literal (0, 1, -1) or a Coefficient."""
+        """Return `terms` and `constant`; a Coefficient, which has an index, replaces each number except 0, 1 and -1."""
         key = tuple((i, rounded(c)) for i, c in terms), rounded(constant)
         numbers = self._indexed_terms.get(key)
         if numbers is None:

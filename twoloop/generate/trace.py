@@ -428,7 +428,8 @@ class TraceCache:
     groups : group of each parameter. 0: the parameter is a constant in the traces. 1, 2, ...: number of a group, whose
         parameters have equal magnitudes; with a minus sign if the parameter is negative.
     Fields:
-    parameters : parameters with which callbacks are traced: Parameters with random values, and constants.
+    parameters : what callbacks get as parameters during a trace: the numbers of group 0 unchanged, and in place of
+        each other number a Parameter with a random value, which is the same in the whole group except for its sign.
     traced_kinds : names of callbacks that were traced, so they do not branch, and always write to the same entries.
     within_bounds : names of traced callbacks that were found, for one of the systems, to use no index out of bounds.
     """

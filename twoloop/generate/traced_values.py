@@ -33,7 +33,7 @@ N_NEARBY = 8  # before a run, calls and traces are compared at the start, and at
 RELATIVE_TIMES = np.linspace(0.0, 1.0, N_NEARBY)  # times of the random states, from 0 (start of the run) to 1 (its end)
 NEARBY_DISTANCE = 0.3  # largest distance of a random position from the start, relative to the sizes of the coordinates
 MAX_STATES_OF_CHUNK = 32  # a `Sample` takes at most about this number of states from one chunk of steps
-MAX_STATES = 64  # about the largest number of states in a comparison, and largest number of chunks in a `Sample`
+MAX_STATES = 64  # largest number of states in a comparison, and of chunks of steps from which a `Sample` keeps states
 MAX_STATES_IN_PYTHON = 9  # replaces MAX_STATES if the callbacks are called in Python
 MAX_ENTRIES = 20_000  # so few states are compared that (states) * (results per state) does not much exceed this
 # the scale of a callback's rounding errors: the largest bound on errors of its results, divided by EPS (see checks.py)
@@ -169,7 +169,7 @@ class CallbackTraces:
 
 
 class Sample:
-    """States [t, q, v] of a run, all or some, at which calls and traces are compared later; `n`: length of [q, v]."""
+    """All or some states [t, q, v] of a run, to compare callbacks with their traces later; `n`: length of [q, v]."""
 
     def __init__(self, t: float, state: Array, n: int) -> None:
         self._n, self._chunks = n, list[Array]()

@@ -25,8 +25,9 @@ MAX_VELOCITY_ROUNDING = 10.0
 # is below SINGULAR_PIVOT, or below SINGULAR_PIVOT_RATIO times the larger ratio at the ends of its interval
 SINGULAR_PIVOT_RATIO = 0.01
 SINGULAR_PIVOT = 1e-5
-# a position is singular even above SINGULAR_PIVOT if its pivot ratio r is below WEAK_PIVOT, and r * (change of v by
-# projection, in tolerances) is below MAX_VIOLATION: this product estimates the violation, which may then be rounding
+# a position also counts as singular if its pivot ratio r is below WEAK_PIVOT, and r * (change of v by the projection,
+# in tolerances) is below MAX_VIOLATION. This product estimates the violation of the constraints by v before the
+# projection. So small a violation may consist of rounding errors, which the projection amplifies by 1 / r
 MAX_VIOLATION, WEAK_PIVOT = 10.0, 0.05
 
 

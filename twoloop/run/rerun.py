@@ -55,9 +55,10 @@ def check_callbacks_along_run(
     difference. Python forces are called twice, and must return equal values. If `check_derivatives`, derivatives are
     compared with exact ones, or with finite differences. `end`: time at which the run ended.
 
-    `is_due`: if True, compare at all states that `states(True)` returns (rows [t, q, v], latest first). If False,
-    compare only at those of `states(False)` outside the region of earlier comparisons, see `CheckedRegion`.
-    `is_inside`: whether the whole run is in this region.
+    `is_due`: if True, states to compare are chosen from `states(True)`: rows [t, q, v]; the last is the run's start.
+    If False, this is also done if varied parameters are outside the region of earlier comparisons, see `CheckedRegion`.
+    Otherwise, states are chosen from those rows of `states(False)` that are outside this region; no states are compared
+    if `is_inside` (the whole run is inside the region), or if `end` <= run.compared_until[0].
     """
     if changed := describe_changed_force(run):
         return Status.WRONG_TRACE, f"{changed} {message}"

@@ -87,7 +87,7 @@ def _run_program(program, numbers, nodes, t, q, v):
 
 @exact
 def _result_indices(program):
-    """Return how many results a program has, where they begin in `nodes`, and where it lists their output indices."""
+    """Return n, the first index of n results in w.nodes, and where `program` lists their indices in the output."""
     n = program[N_RESULTS]
     return n, program[N_NODES] - n, N_SIZES + N_COLUMNS * program[N_ROWS] + program[N_TERMS]
 

@@ -121,7 +121,7 @@ def choose_steps(work, control, status, n_steps):
 
 @compiled
 def set_end(work, control):
-    """Set T_NEW, the time of the new state, to T + X or, at the end of the run, exactly to t1 (no rounding error)."""
+    """Set T_NEW, the time X seconds after the step began at T, to T + X, or exactly to t1 if the run ends then."""
     for k in range(LANES):
         t, x = work[at.T * LANES + k], work[at.X * LANES + k]
         work[at.T_NEW * LANES + k] = control[at.T1] if x == control[at.T1] - t else t + x

@@ -92,13 +92,13 @@ def memory_size(s: int, n: int) -> int:
 
 @merged
 def vector_offset(memory, n, block):
-    """Return the offset of a block of n vectors, such as START; `memory`: offset of the method's memory."""
+    """Return the offset of `block`, such as START: n vectors (one number per lane) in memory at offset `memory`."""
     return memory + N_SINGLE_VECTORS + block * n
 
 
 @merged
 def block_offset(memory, n, s, block):
-    """Return the offset of a block of s n vectors, such as STAGES; `memory`: offset of the method's memory."""
+    """Return the offset of `block`, such as STAGES: s * n vectors (a number per lane) in memory at offset `memory`."""
     return memory + N_SINGLE_VECTORS + (N_VECTORS + block * s) * n
 
 

@@ -67,9 +67,10 @@ class _PartSupports:
     def can_eliminate(self, joint: int) -> bool:
         """Return True if a joint may be eliminated before the remaining hubs (bodies with many joints).
 
-        A part is a set of bodies that eliminated joints connect. Such joints may also connect it to its supports, the
-        ground and hubs. The joint may be eliminated if it involves no hub, and no hub supports a part that it connects,
-        or if one of these parts has no support, and the joint involves none of the `lone_bodies`.
+        A part is a set of bodies that eliminated joints connect. Supports of a part are the ground and hubs to which
+        eliminated joints connect the part. The joint may be eliminated in either of two cases:
+        - The joint involves no hub, and no part that the joint connects has a hub as a support.
+        - The joint involves none of the `lone_bodies` (hubs with one coordinate), and connects a part without support.
         """
         bodies = self.joints[joint]
         parts = {self.parts.find(body) for body in bodies if body not in self.hubs}
@@ -252,7 +253,7 @@ Entries = tuple[Integers, Integers]  # row indices and column indices of the non
     N_RUNS,  # length of the list from `update_runs_of`: two numbers for each range of updates
     N_OF_MASS,  # number of entries of the mass matrix M in the list from `mass_entries_of`
     N_OF_JACOBIAN,  # number of entries of the constraint Jacobian G in the list from `jacobian_entries_of`
-    N_STIFFENED,  # number of products g_i g_j (g: row of G) that are added to a singular M, times a factor
+    N_STIFFENED,  # number of terms s g_i g_j (s: factor, g: row of G) that are added to M if M is singular
     N_HEAD,
 ) = range(9)
 ALWAYS_ALLOWED_UPDATES = 3_000_000  # a program is always written if it has at most this number of updates

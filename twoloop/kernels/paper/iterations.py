@@ -107,7 +107,7 @@ def _compensated_sum(x, rounding, increment):
 
 @merged
 def _clear_rounding_errors(coordinates, rounding):
-    """Set this attempt's rounding errors of dependent `coordinates` to 0: the inner loop changes these coordinates."""
+    """Set to 0 this attempt's recorded rounding errors of dependent `coordinates`, which the inner loop changes."""
     for i in range(N_ROUNDING // 2, rounding.shape[0]):
         for m in coordinates:
             rounding[i, m] = 0.0

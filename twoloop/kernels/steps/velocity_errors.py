@@ -24,7 +24,7 @@ from twoloop.kernels.steps.stages import INNER_TOL, block, vector
 # a velocity error that changes as slowly as the motion is not due to a vibration. Such an error keeps its sign in later
 # steps, so that position errors add up. To allow for this, the error's duration is multiplied by up to this factor
 SLOW_FACTOR = 10.0
-LONGEST_GAPS = 10.0  # largest assumed duration of velocity errors / longest allowed time between evaluations
+LONGEST_GAPS = 10.0  # largest result of `motion_time` / longest allowed time between evaluations of the equations
 STEPS_TO_DECAY = 10.0  # number of steps after which fast components of a velocity error count as decayed
 FAST_DURATION = 20.0  # the duration of a velocity error is short if below this * z (step size * method's coefficient)
 OUTDATED_CHANGE = 0.3  # the Jacobian J of the equations of motion is outdated if its relative change exceeds this
