@@ -124,6 +124,7 @@ def test_small_errors_that_add_up_and_fields_that_are_wrong(method, tolerance):
     for wrong in (
         replace(result, system=right.system),
         replace(right, lam=2.0 * right.lam),
+        replace(right, a=(1.0 + 60.0 * tolerance) * right.a),
         replace(right, a=result.a),
     ):
         with pytest.warns(CertificateWarning, match="Not passed"):

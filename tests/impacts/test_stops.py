@@ -455,6 +455,15 @@ def test_an_impact_that_would_add_energy_is_refused():
 NO_TANGENTS = Tangents(np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros(0, dtype=np.int64))
 
 
+@pytest.mark.parametrize("law", [None, "moreau"])
+def test_a_light_and_a_heavy_body_hit_stops_together(law):
+    system = unconstrained(lambda t, q, v: np.zeros(4), 4, mass=np.diag([1e6, 1e6, 1e-12, 1e-12]))
+    stops = [Stop(lambda t, q, k=k: q[k], 0.5, "stop", 0.2, lambda t, q, k=k: q[k + 1]) for k in (0, 2)]
+    result = solve_with_stops(system, (0.0, 1.0), [0.5, 0.0] * 2, [-1.0, 0.6] * 2, stops, law=law)
+    assert result.success, result.message
+    np.testing.assert_allclose(result.v[:, -1], [0.5, 0.6 - 0.2 * 1.5] * 2, atol=1e-9)
+
+
 @pytest.mark.parametrize("joints", [0, 2])
 def test_stops_that_depend_on_one_another_keep_their_conditions(joints):
     """Up to four stops in two directions, whose rates need not fit together, with joints that friction holds."""

@@ -77,7 +77,7 @@ def tables() -> Tables:
     values = _legendre(x)
     weights = 2 / (N * (N - 1) * values[N - 1] ** 2)
     norms = np.array([np.longdouble(2) / (2 * k + 1) for k in range(N)])
-    norms[N - 1] = np.longdouble(2) / (N - 1)  # what the quadrature rule yields for the integral of P_8^2 (2 / 17)
+    norms[N - 1] = np.longdouble(2) / (N - 1)  # the quadrature rule yields this for the integral of P_8^2, not 2 / 17
     coefficients = values[:N] * weights / norms[:, None]  # [k, j]: Legendre coefficient k of Lagrange polynomial j
     powers = [
         np.array([[sign ** (n + k) * comb(n, k) * comb(n + k, k) for n in range(N)] for k in range(1, N)]).T
@@ -133,12 +133,12 @@ FIRST_DEGREE = 3.0  # degree of the polynomial that predicts the accelerations i
 KAPPA = 0.02  # sweeps end if the estimated error of the iteration, relative to the tolerances, is at most this
 TARGET_SWEEPS = 6.0  # number of sweeps (iterations) in which a step should converge: the step size is chosen for this
 EXTRA_SWEEPS = 7  # a step is rejected if it has not converged after the target number of sweeps and this number more
-MAX_CONTRACTION = 0.8  # if changes by successive sweeps have at least this ratio in sweep 4 or later, reject the step
-MIN_RHO, MAX_RHO = 1e-3, 0.9  # the ratio rho of changes by successive sweeps is clipped to these bounds
-FAST_START, SLOW_START = 0.04, 0.3  # keep a guessed step size if changes by sweeps 2 and 1 have a ratio between these
-STAGNATION_RATIO = 0.5  # sweeps also end if a change may be a rounding error, and is at least this * the change before
+MAX_CONTRACTION = 0.8  # from sweep 4 on, reject the step if |change of v| / |previous sweep's change| is at least this
+MIN_RHO, MAX_RHO = 1e-3, 0.9  # the ratio rho of changes of v by successive sweeps is clipped to these bounds
+FAST_START, SLOW_START = 0.04, 0.3  # keep guessed step sizes if |change of v by sweep 2 / by sweep 1| is between these
+STAGNATION_RATIO = 0.5  # sweeps also end if the change of v is of rounding size and at least this * the previous change
 # with steps of fixed size, sweeps (iterations) end if the error of the iteration is at most KAPPA_OF_FIXED * tolerance,
-# if changes are below ROUNDING_OF_FIXED * |v| (v: velocities) and decay no more, or after MAX_SWEEPS_OF_FIXED
+# if changes of velocities v are below ROUNDING_OF_FIXED * |v| and do not decay, or after MAX_SWEEPS_OF_FIXED sweeps
 KAPPA_OF_FIXED, ROUNDING_OF_FIXED, MAX_SWEEPS_OF_FIXED = 1e-16, 1e-9, 60.0
 SMALLEST_RATIO = 1e-30  # added to (error of the iteration) / KAPPA before its logarithm is taken: the error may be 0
 ERROR_WEIGHT = 0.5  # the estimated error of a step is multiplied by this factor, see `_estimate_error`
@@ -185,7 +185,7 @@ class CollocationCode:
 
         if self.split_functions is None:
             programs = [*self.equations.accelerations, self.equations.position_projection, self.equations.projection]
-        else:  # if equations are split into functions, `shared.digest` covers all programs except the first one
+        else:  # the equations are split into functions, on which `shared.digest` already depends
             programs = self.equations.accelerations[:1]
         numbers = self.numbers
         description = [[each.sizes, *numbers.structure(each)] for each in programs]
@@ -271,7 +271,7 @@ class CollocationCode:
     def _evaluator(
         self, emit: LaneEmitter, work: Value, state: Value, index: int
     ) -> Callable[[list[Value]], Callable[[], Value]]:
-        """Return the argument `evaluate` of `_iterate`: it writes calls of the program `accelerations[index]`."""
+        """Return a function `evaluate` for `_iterate`; it writes calls of the program `accelerations[index]`."""
         accelerations = Emitter(emit.builder).pointer(work, self.a_offset)
 
         def evaluate(inputs: list[Value]) -> Callable[[], Value]:
@@ -449,8 +449,8 @@ class CollocationCode:
     def _repeated(self, emit: LaneEmitter, work: Value, state: Value) -> Iterator[list[Value]]:
         """Return a context manager: the code of its block runs once in a sweep, or twice if the field REPEATS is 1.
 
-        The code computes accelerations from velocities that the context manager yields. The first pass uses the
-        velocities of the previous sweep; the second integrates the accelerations of the first, to save sweeps.
+        The code computes accelerations from velocities that the context manager yields. First, these are the
+        velocities of the previous sweep. If the code runs again, they are integrals of the accelerations just computed.
         """
         builder, num, first_offset = emit.builder, Emitter(emit.builder), integer(self.v_offset)
         before, loop, repeat, after = builder.block, *(builder.append_block() for _ in range(3))
@@ -467,12 +467,12 @@ class CollocationCode:
             v0, a0 = (num.load(num.pointer(state, i), m * self.n) for m in (1, 2))
             of_v = self._weighted_accelerations(emit, tables().velocities, a0, work, i)
             store_lanes(emit, emit.fma(h, of_v, emit.broadcast(v0)), num.pointer(work, k * LANES), self.spectrum_offset)
-        offset.add_incoming(integer(self.spectrum_offset), builder.block)  # offset of the velocities in the second pass
+        offset.add_incoming(integer(self.spectrum_offset), builder.block)  # offset of v when the loop's code runs again
         builder.jump(loop)
         builder.position_at_end(after)
 
     def _load_iterated(self, emit: LaneEmitter, pointer: Value) -> list[Value]:
-        """Return values at the nodes for each coordinate: loaded from `pointer` if it is iterated, otherwise 0."""
+        """Return values of all coordinates at the nodes: iterated ones are loaded from `pointer`, the others are 0."""
         values = [emit.constant(0.0)] * self.n
         for k, i in enumerate(self.iterated_coordinates):
             values[i] = load_lanes(emit, pointer, LANES * k)
@@ -523,10 +523,10 @@ class CollocationCode:
         num.store(builder.extract(factors, 1), work, mem.FACTOR_OF_ERROR)
 
     def find_defect(self, emit: LaneEmitter, work: Value, state: Value, numbers: Value) -> Value:
-        """Write code for the largest |deviation of accelerations from the equations| / limit, halfway between nodes.
+        """Write code for the defect: the largest |deviation from the equations| / its limit, halfway between nodes.
 
-        Return this ratio; INVALID if pivots are too small or accelerations are not finite. The limit is ALLOWED_DEFECT
-        * (tolerance of the velocity) / h. The code stores FACTOR_OF_DEFECT: the largest allowed (next h) / h.
+        Return the defect, or INVALID if pivots are too small or accelerations are not finite. The limit (h: step size)
+        is ALLOWED_DEFECT * (velocity tolerance) / h. The code stores FACTOR_OF_DEFECT: largest allowed (next h) / h.
         """
         builder, num, n = emit.builder, Emitter(emit.builder), self.n
         emit.numbers = emit.constants = numbers
@@ -665,7 +665,7 @@ class CollocationCode:
     def _project_in_parts(
         self, emit: LaneEmitter, work: Value, numbers: Value, write: Callable[..., Value], names: tuple[str, ...]
     ) -> None:
-        """Do the same as `_project` if equations are split into functions; `write` writes calls of these functions."""
+        """Write the code of `_project` for equations split into functions; `write` writes calls of these functions."""
         num, moved = Emitter(emit.builder), emit.builder.allocate(DOUBLE, LANES * self.n)
         indices = {name: num.pointer(work, index) for name, index in self._end_offsets().items()} | {"moved": moved}
         state = load_lanes(emit, work, self.end_offset), indices["q"], indices["v"]
@@ -690,7 +690,7 @@ class CollocationCode:
         store_lanes(emit, emit.builder.select(is_valid, before, emit.constant(0.0)), work, mem.VALID)
 
     def _integrate(self, emit: LaneEmitter, work: Value, state: Value) -> Value:
-        """Write code that integrates accelerations to v, q at nodes; return the largest |change of v| / tolerance."""
+        """Write code that integrates accelerations to v and q at nodes; return max |new v - old v| / tolerance of v."""
         num = Emitter(emit.builder)
         with loop_over_coordinates(emit, self.iterated_coordinates, [emit.constant(0.0)]) as (k, i, (largest,), new):
             before = load_lanes(emit, num.pointer(work, k * LANES), self.v_offset)
@@ -777,7 +777,7 @@ def _compile(shared: SharedCode) -> Collocation:
         module = Module(splits_blocks=is_split)
         for name, emit in writers.items():
             llvm_code.write(module, name, KIT.llvm_signature(name), emit, partial(LaneEmitter, lanes=LANES))
-        # all coefficients were known before writing: else the functions would read beyond the end of their array
+        # writing must not add coefficients: the functions would read them beyond the end of their array
         assert len(code.numbers.values) == len(numbers)
         return list(writers), str(module)
 

@@ -36,10 +36,10 @@ from twoloop.kernels.compile.generated_functions import generated_functions
 from twoloop.problem.system import ConstrainedSystem
 
 DOUBLE_POINTER = f"{DOUBLE}*"
-# generated code is not used if the relative error of its accelerations near the start exceeds LARGEST_LOSS. This is
-# checked only if PivotChoice has added rows, or refines solutions. During runs, the error grew by a factor of up to 200
+# generated code is not used if its accelerations near the start have a relative error above LARGEST_LOSS; in runs,
+# errors were up to 200 times larger. Only code that refines solutions, or adds s g^T g to M (g: row of G), is tested
 LARGEST_LOSS = 1e-8
-MAX_POSITIONS, SPACING = 4, 0.02  # number and spacing (m or rad) of positions that are tried to check LARGEST_LOSS
+MAX_POSITIONS, SPACING = 4, 0.02  # number of positions that `_relative_error` may try, and their spacing (m or rad)
 
 
 def write_accelerations(
@@ -164,7 +164,7 @@ def _acceleration_function(emit: Emitter, equations: Elimination, index: int, nu
 
 
 def _coefficient_pointers(emit: Emitter) -> list[Value]:
-    """Return a pointer to all coefficients; in SIMD lanes, two: to those that vary between lanes, and to the others."""
+    """Return a pointer to all coefficients; in SIMD lanes, one to those that vary between lanes, one to the others."""
     constants = getattr(emit, "constants", None)
     return [emit.numbers] if constants is None else [emit.numbers, constants]
 
@@ -173,14 +173,14 @@ def _stack_array(emit: Emitter, size: int) -> Value:
     return emit.builder.allocate(DOUBLE, size * width_of(emit.double_type))
 
 
-# equations are split into functions if they have more operations than a limit. If null_space.py yields a short program
-# for accelerations, the limit is SPLIT_PROJECTIONS, and only projections are split: this halves the compile time. If
-# not, the limit is SPLIT_ALL, and accelerations are split, too: this makes them 50 % slower
+# equations with more operations than a limit are split into functions. If accelerations have a `reduced_program` (see
+# null_space.py), the limit is SPLIT_PROJECTIONS, and only projections are split, which halves the compile time.
+# Otherwise, the limit is SPLIT_ALL, and accelerations are split, too, which makes them 50 % slower
 SPLIT_PROJECTIONS, SPLIT_ALL = 200, 500
 
 
 class SplitFunctions:
-    """Generator that splits long equations into parts: LLVM functions, called for accelerations and for projections.
+    """Code generator that splits long equations into parts: LLVM functions for accelerations and for projections.
 
     The part "factors" factorizes the matrix [M G^T; G 0] of M a + G^T lam = r, G a = c, and stores the factors.
     solution : programs that compute the factors and the solution.
@@ -228,7 +228,7 @@ class SplitFunctions:
         return list(functions)
 
     def _call(self, emit: Emitter, *calls: tuple[str, Sequence[Value]]) -> Value:
-        """Write `calls` (function, arguments), and missing functions; return a flag: 1 if all results are valid."""
+        """Write `calls` (part, arguments), and the parts not yet written; return a flag: 1 if all calls succeed."""
         module, all_valid = emit.builder.module, None
         for part, arguments in calls:
             name = f"{part}_{emit.suffix}"
@@ -241,7 +241,7 @@ class SplitFunctions:
         return all_valid
 
     def _lowering(self, emit: Emitter, graph: Graph, args: Sequence[Value], stored: Mapping[int, Location]) -> Lowering:
-        """Return a Lowering, which writes operations; `args` begin with three inputs and a pointer to coefficients."""
+        """Return a Lowering, which writes operations. args[:3]: inputs of `graph`; args[3]: pointer to coefficients."""
         *inputs, emit.numbers = args[:4]
         if width_of(emit.double_type) > 1:
             emit.constants = emit.numbers  # type: ignore[attr-defined]  # the coefficients are the same in all lanes
@@ -261,7 +261,7 @@ class SplitFunctions:
         return lowering.is_valid(solution.factor_program, [])
 
     def _write_part(self, program: Program, stored: Mapping[int, int], emit: Emitter, *arguments: Value) -> Value:
-        """Write code that stores the results of `program` in the last `arguments`; return a flag: 1 if they are valid.
+        """Write code that stores the results of `program` in the last `arguments`; return a flag: 1 if all are valid.
 
         Keys of `stored`: quantities that the code loads from the array `arguments[4]`; values: indices in this array.
         """
@@ -343,7 +343,7 @@ class SplitFunctions:
         return is_valid
 
     def _stack_arrays(self, emit: Emitter) -> list[Value]:
-        """Return scratch arrays for factors of [M G^T; G 0], right-hand sides r and c, multipliers or a change of v."""
+        """Return four scratch arrays: factors of [M G^T; G 0], right sides r and c, multipliers (or a change of v)."""
         sizes = self.solution.n_stored, self.n, self.n_rows, max(self.n, self.n_rows)
         return [_stack_array(emit, size) for size in sizes]
 
@@ -371,7 +371,7 @@ Array = NDArray[np.float64]
 def write_function(
     module: Module, name: str, kind: tuple[str, list[str]], program: Program, numbers: Coefficients
 ) -> None:
-    """Write the LLVM function `name`, which computes the arrays of a program from its inputs.
+    """Write the LLVM function `name`, which runs a program: it computes arrays of results from the program's inputs.
 
     If the program's conditions hold and its first array is finite, the function stores the arrays and returns true;
     else it stores nothing and returns false. `kind`: types of its result and arguments.
@@ -454,7 +454,7 @@ class GeneratedCode(NamedTuple):
         return self.traced.kinds
 
     def is_valid_from(self, system: ConstrainedSystem, t0: float, q0: Array) -> bool:
-        """Return True if a run may start at (t0, q0) with this code: if the same rows and pivots are chosen there."""
+        """Return True if a run may start at (t0, q0) with this code: the code has the rows and pivots chosen there."""
         try:
             return _choice_at(system, t0, q0) == self.shared.equations.choice
         except Untraceable:
@@ -490,8 +490,8 @@ def generated_code(system: ConstrainedSystem, t0: float, q0: Array, check: Check
 def _relative_error(code: GeneratedCode, system: ConstrainedSystem, t0: float, q0: Array) -> float:
     """Return the relative error of accelerations by generated code, for velocities 0, at or near the start (t0, q0).
 
-    At most MAX_POSITIONS positions are tried until pivots are large enough; if no position has such pivots, return
-    infinity. Two generated functions compute accelerations, one of them after a projection: return the larger error.
+    If pivots are too small for the code, try the next position; return infinity after MAX_POSITIONS of them. Return the
+    larger error of two generated functions, one with projection; 0 if exact accelerations cannot be computed.
     """
     rows, n = list(code.shared.equations.choice.rows), system.n_q
     v, a, reduced, lam = np.zeros(n), np.empty(n), np.empty(n), np.empty(system.n_c + system.n_a)

@@ -87,7 +87,7 @@ def _derive_programs(system: ConstrainedSystem, missing: Sequence[str], cache: T
 
 
 def _missing_derivatives(equations: Equations, missing: Sequence[str]) -> dict[str, dict[int, Affine]]:
-    """Return {index in array: expression} for "gamma" (of C, then A) and "jacobian" (nonzero entries of flat C_q)."""
+    """Return missing derivatives, "gamma" (of C, then of A) and "jacobian" (nonzeros), as {flat index: expression}."""
     system = equations.system
     gamma: dict[int, Affine] = {}
     for kind, first in (("gamma", 0), ("nonholonomic_gamma", system.n_c)):
@@ -125,7 +125,7 @@ def _trace_derivatives(system: ConstrainedSystem, cache: TraceCache) -> Callback
     equations = cache.equations(system)
     callbacks = [kind for kind in ("jacobian", *GAMMA_SOURCES) if kind in system.given]
     exprs = {kind: equations.derivatives(kind) for kind in (*callbacks, *(["constraint_rate"] if system.n_c else []))}
-    # derivatives of a wrong trace are wrong: so traces of differentiated callbacks are compared with calls, too
+    # derivatives of a wrong trace are wrong: so the traces that are differentiated are also compared with callbacks
     exprs |= {kind: equations.expressions(kind) for kind in ("constraint", "nonholonomic", "nonholonomic_rate")}
     return CallbackTraces(system, equations.graph, exprs)
 

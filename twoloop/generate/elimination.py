@@ -11,7 +11,7 @@ matrices M and -G M^-1 G^T: none is zero.
 
 - If a row of G has a much smaller pivot than it would have without the other rows, this row nearly depends on the other
   rows, and the generated code reports that its results are invalid.
-- The same factors are used to compute the nearest position and velocity on the constraints, in the metric of M.
+- The factors of the matrix also yield the nearest position and velocity on the constraints, in the metric of M.
 - If M is singular, terms s g^T g are added to it: g are rows of G, and s is the scale of a row. In short, "rows are
   added to M". This changes neither accelerations nor projections.
 - If rows of G are redundant, the equations contain independent rows only.
@@ -51,21 +51,21 @@ RANK_TOL = 1e-9  # a row g of G depends on others if the norm of its part orthog
 # the relative pivot of a row of G is its pivot / the pivot that it would have if G had no other rows. Results are
 # invalid if a relative pivot is below a limit: about this fraction of the smallest relative pivot at a run's start
 PIVOT_FRACTION = 0.01
-MIN_PIVOTS = 10.0 ** np.arange(-2, -9, -1)  # possible limits of relative pivots; below 1e-8, rounding errors dominate
-# let p be the smallest relative pivot at the start. The limit of relative pivots during the run is MIN_PIVOTS[i] for
-# the first i with START_LIMITS[i] <= p; if there is no such i, the limit is MIN_PIVOTS[-1]
+MIN_PIVOTS = 10.0 ** np.arange(-2, -9, -1)  # possible PivotChoice.min_pivot; below 1e-8, rounding errors dominate
+# let p be the smallest relative pivot (see PIVOT_FRACTION) at a run's start. PivotChoice.min_pivot is MIN_PIVOTS[i]
+# for the first i with START_LIMITS[i] <= p, or MIN_PIVOTS[-1] if there is no such i
 START_LIMITS = MIN_PIVOTS[:-1] / PIVOT_FRACTION
-# M + s G^T G (s: scales of rows) is tried in place of M if the limit of relative pivots is MIN_PIVOTS[i], and i is at
-# least a minimum. For up to N_FEW_COORDINATES coordinates, the minimum is MIN_INDEX_FEW or, if M is singular,
-# MIN_INDEX_FEW_SINGULAR, as Euler parameters lose two digits even in sound models. For more coordinates, the code would
-# get much longer: the minimum is MIN_INDEX_MANY or, if M is singular, MIN_INDEX_MANY + 1
+# M + s G^T G (s: scales of rows) is tried in place of M if PivotChoice.min_pivot would be MIN_PIVOTS[i] with i >= m.
+# With at most N_FEW_COORDINATES coordinates, m is MIN_INDEX_FEW or, if M is singular, MIN_INDEX_FEW_SINGULAR, because a
+# singular M (Euler parameters) costs two digits even in sound models. With more coordinates, M + s G^T G makes the code
+# much longer. Then m is MIN_INDEX_MANY or, if M is singular, MIN_INDEX_MANY + 1
 N_FEW_COORDINATES = 24
 MIN_INDEX_FEW, MIN_INDEX_FEW_SINGULAR, MIN_INDEX_MANY = 4, 5, 6
 ADDED_SIZE = 16.0  # scales s are chosen so that the largest entry of s G^T G is about this * the largest entry of M
 MAX_PIVOT_RATIO = 1e5  # solutions are refined if a diagonal entry of M + s G^T G is above this * the pivot of its row
-SCALE_STEP = 1024.0  # ratios of scales s are powers of this large number: so runs from most positions share code
+SCALE_STEP = 1024.0  # in M + s G^T G, ratios of scales s are powers of this: it is large, so that most runs share code
 DISPLACEMENT = 0.2  # displacement of coordinates (m or rad) to a position where no entry of M and G is zero by chance
-MIN_GAIN = 2  # M + s G^T G replaces M if the limit of relative pivots rises by at least this many powers of ten
+MIN_GAIN = 2  # M + s G^T G replaces M if PivotChoice.min_pivot rises by at least this many powers of ten
 # dependent coordinates are eliminated (null_space.py) only if there are at least this many constraints per coordinate:
 # with fewer, the linear system for the multipliers is smaller than the one for the independent accelerations
 MIN_ROW_RATIO = 2.0 / 3.0
@@ -102,8 +102,8 @@ class PivotChoice:
         """
         mass, G = mass_and_rows(system, t, q)
         choice = PivotChooser(system).choose(mass, G, partial(_nearby, system, t, q))
-        # refine solutions only if min_pivot is the smallest possible one, or if light bodies may lose digits: in all
-        # other cases, random models had 8 correct digits without refinement
+        # refine solutions only if min_pivot is the smallest possible one, or if added terms s g^T g may cost digits.
+        # In all other cases, random models had 8 correct digits without refinement
         is_uncertain = choice.min_pivot <= MIN_PIVOTS[-1] or _may_lose_digits(choice, mass, G)
         choice = replace(choice, is_refined=choice.is_refined or (bool(choice.rows) and is_uncertain))
         return replace(choice, blocks=DependentColumns(system, choice.rows).blocks(G))
@@ -113,8 +113,8 @@ class DependentColumns:
     """Chooser of the dependent coordinates, which the independent rows of G determine from the other coordinates.
 
     rows : indices of the independent rows of G.
-    choose (field) : compiled function choose(G, *arguments), which stores pivot blocks and returns their number. None:
-        no coordinates are eliminated, as G has too few rows, or it is unknown which entries of G are constant.
+    choose (field) : compiled function choose(G, *arguments), which stores pivot blocks and returns their number. It
+        is None if `rows` are fewer than MIN_ROW_RATIO * n_q, or if it is unknown which entries of G are constant.
     """
 
     choose: Any = None
@@ -140,7 +140,7 @@ class DependentColumns:
 
 def _entry_kinds(system: ConstrainedSystem) -> Any:
     """Return the kinds of the entries of G (0: always zero, 1: constant, 2: varies), or None if they are unknown."""
-    if system.called_in_python:  # Python functions may store their arguments: do not call them with symbols yet
+    if system.called_in_python:  # Python functions may store their arguments: do not call them with symbols
         return None
 
     def find_kinds(equations: Callable[[], Equations]) -> Any:
@@ -172,7 +172,7 @@ class PivotChooser:
         self._last_key, self._last_choice = (0, b"", 0.0), PivotChoice((), (), (), 0.0)
 
     def choose(self, mass: Array, G: Array, nearby: Callable[[], tuple[Array, Array]]) -> PivotChoice:
-        """Return the PivotChoice, but without pivot blocks, for the values of M and G at a position.
+        """Return the PivotChoice for the values of M and G at a position; its field `blocks` remains empty.
 
         `nearby` returns M and G at another position, where no entry is zero by chance. Raise Untraceable if M is
         singular on velocities that the constraints allow.
@@ -199,7 +199,7 @@ class PivotChooser:
         return choice
 
     def _min_pivot_index(self, choice: PivotChoice, scales: Sequence[float], mass: Array, G: Array) -> int:
-        """Return the index, in MIN_PIVOTS, of the limit of relative pivots for M + s g^T g (g: `choice.added_rows`).
+        """Return the index in MIN_PIVOTS of min_pivot if M + s g^T g (s: `scales`; g: `choice.added_rows`) replaces M.
 
         Return -1 if M + s g^T g is not positive definite, or if the independent rows differ from `choice.rows`.
         """
@@ -210,7 +210,7 @@ class PivotChooser:
         return index if index >= 0 and chosen[2 : 2 + chosen[0]].tolist() == list(choice.rows) else -1
 
     def _try_added_rows(self, choice: PivotChoice, factors: Array, mass: Array, G: Array, index: int) -> PivotChoice:
-        """Return a choice with M + s G^T G instead of M, if this makes pivots much larger; else return `choice`.
+        """Return a choice with M + s G^T G (s: scales of rows) instead of M if pivots get much larger; else `choice`.
 
         A body may have little inertia about its joints, such as a rod with a mass in its middle. Then rows of G are
         nearly dependent in the metric of M, and a smallest pivot of 10^-k costs up to 2 k digits of accelerations. In
@@ -227,7 +227,7 @@ class PivotChooser:
         return replace(stiffened, min_pivot=float(MIN_PIVOTS[new_index]))
 
     def _stored_choice(self, index: int) -> PivotChoice:
-        """Return the choice that the compiled search stored; raise Untraceable if the search failed (`index` < 0)."""
+        """Return the PivotChoice from the compiled search; raise Untraceable if the search failed (`index` < 0)."""
         from twoloop.kernels.linalg.rank import STAYS_SINGULAR
 
         system, n_rows = self.system, self.system.n_c + self.system.n_a
@@ -255,10 +255,10 @@ def _nearby(system: ConstrainedSystem, t: float, q: Array) -> tuple[Array, Array
 def _scale_factors(singular: Sequence[int], mass: Array, G: Array) -> Array:
     """Return for each row g of G a factor, by which the scale s is multiplied if s g^T g is added to M.
 
-    Without the factor, s g^T g would be as large as the inertia of heavy bodies. If g contains only Euler parameters of
-    a light body, as their norm does, rounding errors would then hide its inertia. `singular`: rows that are added
-    because M is singular. The factor is a negative power of SCALE_STEP if M is small in all columns in which g has
-    nonzero entries, and the rows `singular` have nonzero entries in all these columns, too. Otherwise, the factor is 1.
+    Without the factor, s g^T g would be as large as the inertia of heavy bodies. If g is the constraint on the norm of
+    the Euler parameters of a light body, rounding errors would then hide the inertia of this body. `singular`: rows
+    added because M is singular. The factor is a negative power of SCALE_STEP if M is small in all columns in which g
+    has nonzero entries, and rows `singular` have nonzero entries in all these columns, too. Otherwise, the factor is 1.
     """
     rows, covered = np.abs(G), np.any(G[list(singular)], axis=0)
     has_entry = rows > 0.0
@@ -266,13 +266,13 @@ def _scale_factors(singular: Sequence[int], mass: Array, G: Array) -> Array:
     own /= np.maximum(rows.max(axis=1, initial=0.0), np.finfo(float).tiny) ** 2
     ratio = own / (np.abs(mass).max() / rows.max() ** 2)
     smaller = (ratio > 0.0) & ~rows[:, ~covered].any(axis=1)
-    # as 0.25 is added, the factor is 1 if `ratio` is above SCALE_STEP ** -1.25: such ratios cost no digits
+    # with + 0.25, the factor is 1 if `ratio` (light / heavy inertia) > SCALE_STEP ** -1.25, which costs no digit
     steps = np.ceil(np.log(np.where(smaller, ratio, 1.0)) / np.log(SCALE_STEP) + 0.25)
     return np.asarray(SCALE_STEP ** np.minimum(steps, 0.0))
 
 
 def _may_lose_digits(choice: PivotChoice, mass: Array, G: Array) -> bool:
-    """Return True if light bodies may lose digits: M + s g^T g replaces M, with a small pivot or several scales s."""
+    """Return True if M + sum s g^T g (see PivotChoice) may cost digits: its scales s differ, or a pivot is small."""
     if not choice.added_rows:
         return False
     added, scales = G[list(choice.added_rows)], np.array(choice.scales)
@@ -308,7 +308,7 @@ class Elimination:
     def __init__(self, system: ConstrainedSystem, choice: PivotChoice, equations: Equations | None = None):
         self.equations = Equations(system) if equations is None else equations
         self.system, self.choice, self.graph = system, choice, self.equations.graph
-        self.zero, self._n_reduced = Affine(self.graph, 0.0, {}), 0  # _n_reduced: operations added by `reduced_program`
+        self.zero, self._n_reduced = Affine(self.graph, 0.0, {}), 0  # `reduced_program` adds _n_reduced operations
         n, (self.q, self.v) = system.n_q, (self.equations.q, self.equations.v)
         self.mass = self._callback_terms("mass")
         rows = [self._callback_terms("jacobian"), self._callback_terms("nonholonomic")]
@@ -347,7 +347,7 @@ class Elimination:
         return Program(self.graph, {"": []}, conditions)
 
     def _matrix(self) -> dict[tuple[int, int], Affine]:
-        """Return the nonzero entries of [M G^T; G 0]. G has only the independent rows; M includes terms s g^T g."""
+        """Return the nonzero entries of [M G^T; G 0]; M includes the terms of added_rows, G only independent rows."""
         n = self.system.n_q
         matrix = {(i, j): self.mass[i, j] for i in range(n) for j in range(n) if not is_zero(self.mass[i, j])}
         for i, j in matrix:
@@ -369,7 +369,7 @@ class Elimination:
         return matrix
 
     def _solve(self, r: Sequence[Affine], c: Sequence[Affine]) -> tuple[list[Affine], list[tuple[Affine, Affine]]]:
-        """Solve M a + G^T lam = r, G a = c (c: all rows); return [a, lam] and conditions of validity (see Program)."""
+        """Solve M a + G^T lam = r, G a = c; return [a, lam] (lam: of independent rows), and conditions, see Program."""
         return solve_refined(self.factors.solve, self.choice, self.mass, self.all_rows, r, c)
 
     def _right_sides(self, v: Sequence[Affine]) -> tuple[list[Affine], list[Affine]]:
@@ -414,7 +414,7 @@ class Elimination:
 
     @cached_property
     def right_sides(self) -> Program:
-        """Return the program for "r" (forces), and "c" in G a = c: 0 in redundant rows outside `choice.added_rows`."""
+        """Return the program for "r" (forces) and "c" in G a = c; in redundant rows not in choice.added_rows, c = 0."""
         force, gamma = self._right_sides(self.v)
         used = {*self.choice.rows, *self.choice.added_rows}
         return Program(self.graph, {"r": force, "c": [x if k in used else self.zero for k, x in enumerate(gamma)]})
@@ -432,13 +432,13 @@ class Elimination:
 
     @cached_property
     def position_errors(self) -> Program:
-        """Return the program for "c" in C_q (change of q) = c; c is -C, or 0 in redundant and non-holonomic rows."""
+        """Return the program for "c" in C_q (change of q) = c: -C, or 0 in redundant and non-holonomic rows."""
         errors = [*(-violation for violation in self._callback_terms("constraint")), *[self.zero] * self.system.n_a]
         return Program(self.graph, {"c": self._expand_to_all_rows([errors[k] for k in self.choice.rows])})
 
     @cached_property
     def velocity_errors(self) -> Program:
-        """Return the program for "c" in G (change of v) = c; c: -(C_q v + C_t), -(A v + b), or 0 in redundant rows."""
+        """Return the program for "c" in G (change of v) = c: -(C_q v + C_t) and -(A v + b), or 0 in redundant rows."""
         errors = []
         for row, rate in zip(self.rows, self.rates, strict=True):
             total = rate
@@ -572,7 +572,7 @@ class FactorAndSolvePrograms:
 
     @property
     def n_stored(self) -> int:
-        """Return the number of quantities that the first step stores."""
+        """Return the number of quantities that `factor_program` stores."""
         return len(self.stored_indices)
 
     @cached_property

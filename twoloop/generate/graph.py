@@ -22,11 +22,11 @@ from twoloop.generate.parameter_expressions import (
 from twoloop.generate.parameter_expressions import Untraceable as Untraceable
 from twoloop.kernels.evaluation import operations as op
 
-# derived callbacks and Taylor series with more operations are not generated: to trace these takes longer than most runs
+# derived callbacks and Taylor series with more operations than this are refused: tracing takes longer than most runs
 MAX_TRACED_OPERATIONS = 20_000
-# products that differ by a constant factor are recorded once, without this factor. But the factor stays in the product
-# if results might underflow or overflow: if |factor| is not between MIN_FACTOR and 1 / MIN_FACTOR, and in the squares
-# by which a power with an exponent above HIGH_EXPONENT is computed
+# products that differ by a constant factor are recorded once, without this factor. To avoid underflow and overflow, a
+# product is recorded with its factor if |factor| is not between MIN_FACTOR and 1 / MIN_FACTOR. Squares that yield a
+# power with an exponent above HIGH_EXPONENT are also recorded with their factors
 MIN_FACTOR, HIGH_EXPONENT = 1e-100, 8
 # end of the message if a callback compares an expression, or converts an expression to a number
 BRANCHING_REASON = "it branches on, or converts to a number, what depends on t, q or v"
@@ -126,7 +126,7 @@ class Graph(SymbolicObject):
         return self.quantity(quantity)
 
     def quantities_for(self, exprs: Iterable["Affine"], available: Container[int] = ()) -> list[int]:
-        """Return the indices of the quantities to compute for `exprs`, arguments first, unless they are `available`."""
+        """Return the indices of all quantities to compute for `exprs`, except those in `available`; arguments first."""
         needed: set[int] = set()
         stack = [i for expr in exprs for i in expr.terms]
         while stack:
@@ -164,7 +164,7 @@ class Graph(SymbolicObject):
         return order
 
     def product(self, a: "Affine", b: "Affine") -> "Affine":
-        """Return a * b as a number times a recorded product; products that differ by a constant factor share one."""
+        """Return a * b as a number times a recorded product, the same one for all constant multiples of a and b."""
         if not a.terms:
             return b.times(a.constant)
         if not b.terms:
@@ -183,7 +183,7 @@ class Graph(SymbolicObject):
         return self.operation(op.PRODUCT, a, b)
 
     def square(self, expr: "Affine", is_high_power: bool) -> "Affine":
-        """Return the square of `expr`; if `is_high_power`, the recorded product keeps the constant factor of `expr`."""
+        """Return `expr` squared. If `is_high_power`, the recorded square includes the constant factor of `expr`."""
         return self._product(expr, expr) if is_high_power and expr.terms else self.product(expr, expr)
 
 
@@ -266,7 +266,7 @@ class Affine:
         for i, c in other.terms.items():
             total = terms[i] + c if i in terms else c
             if _magnitude(total) <= CANCELLATION_LIMIT * _magnitude(c):
-                terms.pop(i, None)  # `terms` need not contain i: a new coefficient c may have underflowed to 0
+                terms.pop(i, None)  # i is missing in `terms` if its coefficient c is new, and has underflowed to 0
             else:
                 terms[i] = total
         if _equal(other.constant, 0.0):

@@ -75,7 +75,7 @@ class LaneMemory(NamedTuple):
 
 
 class LaneSteps:
-    """Generator of the code of steps in SIMD lanes, for n coordinates and n_rows multipliers.
+    """Code generator for steps in SIMD lanes, with n coordinates and n_rows multipliers.
 
     Arguments of methods: `emit` appends instructions to a function; `order`: order of the Taylor series; `control` and
     `work`: pointers to settings and to the memory of the lanes. Names in capitals are fields of this memory, such as
@@ -88,7 +88,7 @@ class LaneSteps:
         self.n, self.n_rows = n, n_rows
 
     def update_unit(self, emit: LaneEmitter, control: Value, work: Value) -> Value:
-        """Write code that stores UNIT (s), the unit of time of a series: the step size that the last series allows."""
+        """Write code that stores UNIT, the time unit (s) of the next series: the step size the last series allows."""
         select, unit = emit.builder.select, emit.load(work, lanes.UNIT)
         is_fresh, is_accepted = (is_set(emit, work, field) for field in (lanes.IS_NEW, lanes.ACCEPTED))
         duration = broadcast_entry(emit, control, lanes.T1) - broadcast_entry(emit, control, lanes.T0)
@@ -101,7 +101,7 @@ class LaneSteps:
         return unit
 
     def choose_sizes(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Write code that chooses the step size H (s) by the last two terms of the series, and stores X = H / UNIT."""
+        """Write code that stores the step size allowed by the last two terms of the series: H (s), and X = H / UNIT."""
         builder, n, memory = emit.builder, self.n, self.memory(emit, order, control, work)
         unit, (rtol, atol) = emit.load(work, lanes.UNIT), self.tolerances(emit, control)
         one, norms = emit.constant(1.0), []
@@ -181,7 +181,7 @@ class LaneSteps:
         """
         n, (rtol, atol) = self.n, self.tolerances(emit, control)
         order, h = emit.to_double(memory.order), emit.load(memory.work, lanes.H)
-        # if the step size h is 0, per_duration is infinite: then the tolerances of positions allow any defect
+        # if the step size h is 0, per_duration is infinite: then only the tolerances of velocities limit the defect
         duration, per_duration = h / order, order / h
         largest = max_defect = emit.constant(0.0)
         for each in a:
@@ -195,7 +195,7 @@ class LaneSteps:
         return duration * max_defect
 
     def compute_prediction_error(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Write code that stores PREDICTION_ERROR: the change of q by the projection / the allowed change."""
+        """Write code that stores PREDICTION_ERROR, the change of q by the projection relative to the allowed change."""
         n, memory, (rtol, atol) = self.n, self.memory(emit, order, control, work), self.tolerances(emit, control)
         h = emit.load(work, lanes.H)
 
@@ -228,7 +228,7 @@ class LaneSteps:
     def accept_or_reject(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
         """Write code that accepts (ACCEPTED = 1) or rejects steps, and stores LONGEST, the limit of the next step size.
 
-        After too many rejections or a value that is not finite, a run leaves its lane: RUNNING = 0.
+        A run leaves its lane (RUNNING = 0) after MAX_REJECTIONS + 1 successive rejections, or if a value is not finite.
         """
         builder, one = emit.builder, emit.constant(1.0)
         select, per_order = builder.select, one / emit.to_double(order)
@@ -360,10 +360,10 @@ Tableau = tuple[Array, Array, Array, Array, Array]
 
 
 class LaneStages:
-    """Generator of the stages of an explicit Runge-Kutta method, and of its error estimates, for n coordinates.
+    """Code generator for the stages and error estimates of an explicit Runge-Kutta method, with n coordinates.
 
-    With the matrix A of the Butcher tableau, velocities at stages are sums of accelerations weighted by A, positions
-    are sums weighted by A @ A. Weights are literals in the code; terms with a weight of zero are left out.
+    With the matrix A of the Butcher tableau, velocities at stages are sums of accelerations weighted by A; positions
+    use the weights A @ A. Weights are literals in the code; terms with a weight of zero are left out.
     """
 
     def __init__(self, tableau: Tableau, n: int):
@@ -375,7 +375,7 @@ class LaneStages:
         return [np.asarray(each).tobytes() for each in self.tableau]
 
     def write(self, emit: LaneEmitter, arguments: tuple[Value, Value, Value], memory: LaneMemory) -> None:
-        """Write code that stores the state NEW, X seconds after a step began, and the step's ERROR if it ends there."""
+        """Write code that stores NEW, the state at the end of a step of X seconds, and ERROR, the estimated error."""
         A, b, c, fine_weights, coarse_weights = self.tableau
         _, control, work = arguments
         x, t = emit.load(work, lanes.X), emit.load(work, lanes.T)
@@ -461,7 +461,7 @@ MAX_SERIES_OPERATIONS = 1500  # no code is generated for series with more operat
 
 
 class LaneCode(LaneSteps):
-    """Generator of the code of one mechanism for SIMD lanes, including the step-size control.
+    """Code generator for one mechanism in SIMD lanes, including the step-size control.
 
     series : whether to generate code for Taylor steps.
     tableau : Butcher tableau of an explicit Runge-Kutta method, for whose stages code is generated; None: no such code.
@@ -550,8 +550,8 @@ class LaneCode(LaneSteps):
     def check_defect_within(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
         """Write code that stores WORST_DEFECT, the largest defect at several times within the step.
 
-        The times are equidistant, at most GAP (s) apart. In each step, the times are moved by another fraction SHIFT of
-        the distance that GAP allows. Finally, T_NEW is the time at the end of the step.
+        The step is divided into equal parts of at most GAP (s). The times are the ends of these parts, all moved by
+        (2 SHIFT - 1) * (GAP - size of a part); SHIFT varies from step to step. Finally, T_NEW is the end of the step.
         """
         builder, memory = emit.builder, self.memory(emit, order, control, work)
         h, gap = emit.load(work, lanes.H), broadcast_entry(emit, control, lanes.GAP)
@@ -579,7 +579,7 @@ class LaneCode(LaneSteps):
         emit.store(builder.select(is_last, t1, t + h), work, lanes.T_NEW)
 
     def correct_positions(self, emit: LaneEmitter, order: Value, control: Value, work: Value) -> None:
-        """Write code for a Newton step to C = 0 if ACTIVE = 1; ACTIVE, UNCONVERGED become 1 if it is valid, else 0."""
+        """Write code for a Newton step to C = 0 in ACTIVE lanes; set ACTIVE, UNCONVERGED to 1 on success, else 0."""
         is_active, _ = self._project(
             emit, self.equations.position_projection, lanes.ACTIVE, self.memory(emit, order, control, work)
         )
@@ -642,7 +642,7 @@ class LaneCode(LaneSteps):
         return is_valid, a
 
     def crossing_mask(self, emit: LaneEmitter, memory: LaneMemory) -> Value | None:
-        """Return `orientation_change_mask(...)`; None without constraints, or if defects are checked (Taylor steps)."""
+        """Return the `orientation_change_mask` of a step; None for Taylor steps, and if there are no constraints."""
         if self.recurrences is not None or len(self.equations.rows) == 0:
             return None
         ends_of_step = (lanes.T, memory.state), (lanes.T_NEW, memory.new)
@@ -673,7 +673,7 @@ class LaneCode(LaneSteps):
 
 
 class LaneConstraints(LaneSteps):
-    """Generator of the code for C, C_t and the entries of C_q in SIMD lanes.
+    """Code generator for C, C_t and the entries of C_q in SIMD lanes.
 
     system : a system without nonholonomic rows.
     Fields:

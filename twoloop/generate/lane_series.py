@@ -52,7 +52,7 @@ class LaneEmitter(Emitter):
         return self.broadcast(self.builder.load(pointer, constant=True))
 
     def function(self, name: str, x: Value) -> Value:
-        """Compute the function `name` of x: by an LLVM intrinsic for all lanes, or else by a libm call in each lane."""
+        """Compute the function `name` of x: by an LLVM intrinsic if there is one, else by a libm call in each lane."""
         if name in INTRINSICS:
             return super().function(name, x)
         result, scalar = undefined(self.double_type), Emitter(self.builder)
@@ -91,18 +91,19 @@ class LaneEmitter(Emitter):
         return power * self.polynomial(EXP2_COEFFICIENTS, x - whole)
 
     def minimum_or_nan(self, a: Value, b: Value) -> Value:
-        """Return the smaller one of a and b, but always a if a or b is NaN: so the result is NaN only if a is NaN."""
+        """Return the smaller one of a and b, or a if one of them is NaN. So the result is NaN only if a is NaN."""
         return self.builder.select(self.builder.compare("fcmp ult", a, b), a, b)
 
     def maximum_or_nan(self, a: Value, b: Value) -> Value:
-        """Return the larger one of a and b, but always a if a or b is NaN: so the result is NaN only if a is NaN."""
-        return self.builder.select(self.builder.compare("fcmp ugt", a, b), a, b)
+        """Return the larger one of a and b, or NaN if one of them is NaN."""
+        larger = self.builder.select(self.builder.compare("fcmp ugt", a, b), a, b)
+        return self.builder.select(self.builder.compare("fcmp uno", b, b), b, larger)
 
 
 def load_lanes(emit: LaneEmitter, base: Value, index: int = 0) -> Value:
     """Return the vector base[index : index + STAGES]: one number for each stage of a collocation step.
 
-    The address must be aligned to the vector's size. Loading waits if the numbers have just been stored one by one.
+    The address must be aligned to the vector's size. A load is slow just after the numbers were stored one by one.
     """
     start, kind = emit.builder.advance(base, integer(index)), vector_of(DOUBLE, STAGES)
     return emit.builder.load(emit.builder.convert("bitcast", start, f"{kind}*"), 8 * STAGES)
@@ -125,7 +126,7 @@ def two_sums(emit: LaneEmitter, a: Value, b: Value) -> list[Value]:
 
 
 def gather_lane(emit: LaneEmitter, vectors: Sequence[Value], lane: int) -> Value:
-    """Return a vector of the numbers in lane `lane` of each of `vectors`; for a single vector, return its number."""
+    """Return the numbers in lane `lane` of all `vectors`, as a vector; if there is only one vector, return a scalar."""
     builder, indices = emit.builder, [lane, STAGES + lane]
     if len(vectors) == 1:
         return builder.extract(vectors[0], lane)
@@ -149,14 +150,14 @@ def loop_over_coordinates(
 
 
 ZERO_ROW = -1  # index of a row of zeros in memory; rows 0, 1, ... contain the coefficients of order 0, 1, ...
-# largest number of sums in one loop: each sum needs a register; processors have 32 of eight doubles, or 16 of four
+# largest number of sums in one loop: each sum needs a register; processors have 32 registers of 8 doubles, or 16 of 4
 MAX_SUMS_IN_LOOP = 12 if LANES == 8 else 6
 
 
 class Operation(NamedTuple):
     """Operation on Taylor series; the sine and the cosine of an angle are one operation with two results."""
 
-    kind: int  # such as PRODUCT, see kernels/evaluation/operations.py
+    kind: int  # kind of operation, such as PRODUCT, see kernels/evaluation/operations.py
     results: tuple[int, ...]  # indices of the results of this operation among all quantities
     first: tuple[Terms, float]  # terms and constant of the first argument
     second: tuple[Terms, float]  # terms and constant of the second argument
@@ -207,7 +208,7 @@ class LaneSeries:
         return [self.n, self.n_rows, self.early, self.late, self.rows, self.balance, self.factor_indices]
 
     def _expressions(self, sums: Sums, rows: Sequence[int]) -> list[tuple[Terms, float]]:
-        """Return (terms, constant) of each expression in `sums`; rows[k] is the number of expression k in sums.row."""
+        """Return (terms, constant) of each expression in `sums`. In sums.row, expression k has the index rows[k]."""
         more: dict[int, list[tuple[int, float]]] = {row: [] for row in rows}
         for row, i, c in zip(
             sums.row.tolist(), sums.further_column.tolist(), sums.further_coefficient.tolist(), strict=True
@@ -220,7 +221,7 @@ class LaneSeries:
         ]
 
     def _row_expressions(self, sums: Sums, indices: Any) -> list[tuple[int, tuple[Terms, float]]]:
-        """Return the pair (indices[k], (terms, constant)) for each k: expression k in `sums` is equation indices[k]."""
+        """Return (i, (terms, constant)) for each expression in `sums`; i: index of its equation, from `indices`."""
         return list(zip(indices.tolist(), self._expressions(sums, indices.tolist()), strict=True))
 
     def _make_operations(self, table: OperationGroups, quantity: int) -> list[Operation]:
@@ -244,10 +245,10 @@ class LaneSeries:
     def _shared_sums(self) -> dict[int, tuple[int, int]]:
         """Find products (cos x) x' and (sin x) x', whose sums the recurrences of sin x and cos x already compute.
 
-        (cos x) x' is the derivative of sin x. So the sum for coefficient k + 1 of sin x, divided by the unit of time,
-        is coefficient k of (cos x) x', except for the term that contains coefficient k of x', which is not known yet.
-        The sum for cos x serves for (sin x) x' in this way. In the returned dict, a key is the index of the product
-        among all quantities; the value (x, y) contains the indices of the two series in the sum, see `_factor_index`.
+        (cos x) x' is the derivative of sin x. So its coefficient k, without the term that contains the yet unknown
+        coefficient k of x', is the sum for coefficient k + 1 of sin x divided by the series' unit of time. Likewise,
+        (sin x) x' follows from the sum for cos x. In the returned dict, a key is the index of the product among all
+        quantities; the value (x, y) contains the indices of the two series in the sum, see `_factor_index`.
         """
         pairs: dict[Any, tuple[int, int]] = {}
         for operation in self.early:
@@ -344,7 +345,7 @@ class LaneSeries:
     def _write_order_0(
         self, emit: LaneEmitter, quantities: Quantities, operations: list[Operation], row: "_Row", scratch: Value
     ) -> None:
-        """Write code for order 0 of arguments and results of `operations`; store coefficients of factors in `row`."""
+        """Write code for coefficient 0 of the results of `operations`, and store coefficient 0 of factors in `row`."""
         one, zero = emit.constant(1.0), emit.constant(0.0)
         for operation in operations:
             kind, results, first, second = operation
@@ -383,8 +384,8 @@ class LaneSeries:
         """Write loops for sums over 1 < j < k, and return the sums: of X[j] Y[k - j], and of X[j] Y[k + 1 - j].
 
         Keys of the returned dict: ((index of X, index of Y), True for Y[k + 1 - j] or False for Y[k - j]). For these
-        indices of series X and Y see `_factor_index`. `_PartialSums` adds the terms j = 1 and j = k later: these need
-        the newest coefficients, for which the loops would wait. One loop computes several sums, to load factors once.
+        indices of series X and Y see `_factor_index`. `_PartialSums` adds the terms j = 1 and j = k later: these may
+        need coefficients that are computed after the loops. One loop computes several sums, to load factors once.
         """
         keys = [(pair, True) for pair in self.carried_pairs]
         pairs = {pair for each in (*self.early, *self.late) for pair in self._factors(each)}
@@ -421,7 +422,7 @@ class LaneSeries:
     ) -> None:
         """Write code for Taylor coefficient k = `order` > 0 of the results of `operations`; `inverse`: 1 / k.
 
-        A PENDING product has a second factor with an unknown coefficient k: the term with this coefficient is left out.
+        The second factor of a PENDING product contains v, lam or a: its yet unknown coefficient k is left out.
         """
         pairs = list(dict.fromkeys(pair for operation in operations for pair in self._factors(operation)))
         sums = {}
@@ -468,14 +469,14 @@ class LaneSeries:
 
 
 class _Row:
-    """Row k of the memory: coefficient k of each factor. `load` reuses values that `store` has written to the row."""
+    """Row k of `scratch`: coefficient k of all factors of products. `load` reuses values that `store` has written."""
 
     def __init__(self, code: LaneSeries, emit: LaneEmitter, base: Value):
         self.code, self.emit, self.base = code, emit, base
         self._stored: dict[int, Value] = {}
 
     def store(self, key: Any, value: Value, when: str = "") -> None:
-        """Store the coefficient of the series `key`. If `when` is "if used", store it only for a factor of products."""
+        """Store the coefficient of the series `key`. If `when` is "if used", skip a series that no product contains."""
         index = self.code.factor_indices.get(tuple(key)) if when else self.code.factor_indices[tuple(key)]
         if index is not None and index not in self._stored:
             self._stored[index] = value
@@ -487,20 +488,20 @@ class _Row:
 
 
 class _PartialSums(NamedTuple):
-    """Sums over 1 < j < k of products of coefficients of series X and Y; methods add the terms for j = 1 and j = k."""
+    """Sums over 1 < j < k of X[j] Y[k - j] and X[j] Y[k + 1 - j]; the methods add the terms j = 1 and j = k."""
 
-    sums: dict[tuple[tuple[int, int], bool], Value]  # result of `LaneSeries._write_sums`
-    first_row: Value  # pointer to `row_1`; if k is 1, to a row of zeros, so that products with it are 0
+    sums: dict[tuple[tuple[int, int], bool], Value]  # sums over 1 < j < k, from `LaneSeries._write_sums`
+    first_row: Value  # pointer to `row_1` if k > 1, to a row of zeros if k = 1: then a term of each sum does not exist
     row_1: Value  # pointer to coefficient 1 of all series
     row_before: _Row  # memory that contains coefficient k - 1 of all series
 
     def sum_of_order(self, pair: tuple[int, int]) -> Value:
-        """Return the sum of X[j] Y[k - j] over 0 < j < k; `pair`: indices of the series X and Y in rows."""
+        """Return the sum of X[j] Y[k - j] over 0 < j < k (k: order); `pair`: indices of series X and Y in a `_Row`."""
         emit, (x, y) = self.row_before.emit, pair
         return self.sums[pair, False] + emit.load(self.first_row, x) * self.row_before.load(y)
 
     def sum_of_next_order(self, pair: tuple[int, int], row: _Row) -> Value:
-        """Return the sum of X[j] Y[k + 1 - j] over 0 < j <= k; `pair`: indices of X and Y; `row` has X[k] and Y[k]."""
+        """Return the sum of X[j] Y[k + 1 - j] over 0 < j <= k; `pair`: indices of X, Y in `row` (with X[k], Y[k])."""
         emit, (x, y) = self.row_before.emit, pair
         total = self.sums[pair, True] + row.load(x) * emit.load(self.first_row, y)
         return total + emit.load(self.row_1, x) * row.load(y)

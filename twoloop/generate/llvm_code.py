@@ -197,7 +197,7 @@ class Quantities:
     def __init__(self, emit: Emitter, load: Callable[[int], Value]):
         self._emit, self._load = emit, load
         self._values: dict[int, Value] = {}
-        self._loaded: dict[int, Value] = {}  # values loaded in the current part of the function
+        self._loaded: dict[int, Value] = {}  # by index: quantities that this part of a split function has loaded
         self._part = emit.builder.part
         self._sums: dict[tuple[Terms, float], Value] = {}
 
@@ -206,7 +206,7 @@ class Quantities:
         self._values[quantity] = value
 
     def value(self, quantity: int) -> Value:
-        """Return the value that `define` has set for a quantity, or else load it, once in each part of the function."""
+        """Return the value set by `define` for a quantity, or else load it, once in each part of a split function."""
         if quantity in self._values:
             return self._values[quantity]
         loaded = self._loaded_in_part()
@@ -215,11 +215,11 @@ class Quantities:
         return loaded[quantity]
 
     def mark_stored(self, quantity: int) -> None:
-        """Note that a quantity was stored: later parts of a split function load it, to need fewer registers."""
+        """Record that a quantity was stored: then later parts of a split function load it, and need fewer registers."""
         self._loaded_in_part()[quantity] = self._values.pop(quantity)
 
     def _loaded_in_part(self) -> dict[int, Value]:
-        """Return a dict {quantity: value} of the values that the current part of the function has loaded so far."""
+        """Return a dict {quantity: value} of the values that this part of a split function has loaded so far."""
         if self._part != self._emit.builder.part:
             self._part, self._loaded = self._emit.builder.part, {}
         return self._loaded
@@ -228,7 +228,7 @@ class Quantities:
         """Return `constant` plus the sum of coefficient * quantity over the terms."""
         key = terms, constant
         if self._emit.builder.module.splits_blocks and len(terms) == 1 and constant == 0.0:
-            ((quantity, coefficient),) = terms  # not cached: to multiply again takes no longer than to load the product
+            ((quantity, coefficient),) = terms  # products are not cached: loading one takes as long as multiplying
             return self._emit.scale(coefficient, self.value(quantity))
         if key not in self._sums:
             total: Any = None if constant == 0.0 and terms else self._emit.coefficient(constant)
@@ -366,7 +366,7 @@ class Lowering(Algebra[Value]):
         return self._sines_and_cosines[first.key][kind == COSINE]
 
     def run(self, graph: Graph, quantities: Iterable[int], locations: Mapping[int, Location] = NO_LOCATIONS) -> None:
-        """Write code that computes `quantities` in the given order, and stores those that are keys of `locations`."""
+        """Write code that computes `quantities` in this order, and stores quantity i at locations[i] if i is a key."""
         if not locations:
             return super().run(graph, quantities)
         for i in quantities:
@@ -378,7 +378,7 @@ class Lowering(Algebra[Value]):
         return None
 
     def run_program(self, program: Program) -> list[list[Value]]:
-        """Write code that computes the arrays of a program, and the quantities in its conditions; return the arrays.
+        """Write code for the arrays of a program and the quantities on which their validity depends; return the arrays.
 
         If the function is split into parts, each number is computed right before its use, so that few numbers have to
         be kept from one part to the next; LLVM reorders instructions only within a part.
@@ -399,7 +399,7 @@ class Lowering(Algebra[Value]):
         return [self.affine(expr) for expr in exprs]
 
     def is_valid(self, program: Program, values: Sequence[Value]) -> Value:
-        """Return a flag: 1 if the program's conditions hold, `values` are finite, and |angles| < LARGEST_ANGLE."""
+        """Return 1 if all `conditions` of a program hold, `values` are finite, and |angles| < LARGEST_ANGLE, else 0."""
         emit, builder, zero = self.emit, self.emit.builder, self.emit.constant(0.0)
         total = zero
         for value in values:  # values that are not finite make the sum NaN
@@ -415,6 +415,6 @@ class Lowering(Algebra[Value]):
 def lower_program(
     emit: Emitter, program: Program, inputs: Sequence[Value], numbers: Coefficients
 ) -> tuple[Lowering, list[list[Value]]]:
-    """Write code that evaluates a program at `inputs`; return the Lowering used, and the values of the arrays."""
+    """Write code that evaluates a program at `inputs`; return the Lowering, and the values of the program's arrays."""
     lowering = Lowering(emit, numbers)
     return lowering, program.run(lowering, inputs)

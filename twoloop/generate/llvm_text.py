@@ -49,7 +49,7 @@ class Value:
         self.builder: Any = builder
 
     def __str__(self) -> str:
-        """Return the type and the text, in the form of an argument of a call."""
+        """Return the type and the text, as the arguments of a call are written."""
         return f"{self.type} {self.text}"
 
     def __neg__(self) -> "Value":
@@ -75,7 +75,7 @@ class Phi(Value):
         self.incoming: list[tuple[Value, Block]] = []
 
     def add_incoming(self, value: Value, block: "Block") -> None:
-        """Add the value that the phi node takes if `block` was the last block before its own."""
+        """Add the value that the phi node takes if the program has jumped from `block` to the block of the node."""
         self.incoming.append((value, block))
 
     def line(self) -> str:
@@ -144,7 +144,7 @@ class Module:
 
     def __init__(self, splits_blocks: bool = False) -> None:
         self.splits_blocks = splits_blocks
-        self.block_addresses: list[str] = []  # addresses of parts of split blocks, stored so that LLVM keeps them apart
+        self.block_addresses: list[str] = []  # LLVM does not merge a block in this list with the block before it
         self._tables: list[str] = []
         self._numbers: list[float] = []  # numbers that `Builder.load_constant` loads
         self._declared: dict[str, str] = {}
@@ -201,7 +201,7 @@ class Builder:
         self.arguments = [Value(kind, f"%a{k}", self) for k, kind in enumerate(arguments)]
         self._n_values = self._n_allocated = 0
         self._far_pointer: Value | None = None
-        self.part = 0  # index of the current part of the function: number of times that a block has been split
+        self.part = 0  # index of the current part of the function: number of calls of `_split_block` so far
         self._blocks: list[Block] = []
         self._n_blocks = 0
         self.position_at_end(self.append_block())
@@ -211,7 +211,7 @@ class Builder:
         arguments = ", ".join(map(str, self.arguments))
         body = "\n".join(block.text() for block in self._blocks)
         linkage = "internal " if self.internal else ""
-        # without this alignment, vectors on the stack cross two cache lines, and take twice as long to load and store
+        # if the stack is not aligned, a vector on it lies in two cache lines, and takes twice as long to load and store
         attributes = "noinline alignstack(64)" if f"<{DOUBLES_PER_CACHE_LINE} x" in body else "noinline"
         return f"define {linkage}{self.result} @{self.name}({arguments}) {attributes} {{\n{body}\n}}"
 
@@ -348,7 +348,7 @@ class Builder:
 
     @contextmanager
     def if_then(self, condition: Value) -> Iterator[None]:
-        """Return a context manager; instructions that are appended in its block run only if `condition` is true."""
+        """Return a context manager: instructions appended in its `with` block run only if `condition` is true."""
         then, after = self.append_block(), self.append_block()
         self.branch(condition, then, after)
         self.position_at_end(then)

@@ -22,7 +22,7 @@ import numpy as np
 from twoloop.generate.graph import Affine, is_zero
 
 # accelerations are invalid if a step of refinement changes them by more than this fraction. The relative error after
-# refinement is usually the square of the change, and as large as the change only if a light body's digits are all lost
+# refinement is usually (change)^2; it is as large as the change only if a light body's acceleration had no exact digit
 LARGEST_CHANGE = 1e-7
 
 
@@ -30,8 +30,8 @@ class Block(NamedTuple):
     """Pivot block of the factorization L D L^T: one or two rows that are eliminated together, with one division."""
 
     row_indices: tuple[int, ...]
-    inverse: list[list[Affine]]  # inverse of this 1x1 or 2x2 block of the matrix D in L D L^T
-    rows_below: list[tuple[int, list[Affine]]]  # index and entries of each nonzero row of L below the block
+    inverse: list[list[Affine]]  # inverse of the pivot block, a 1x1 or 2x2 block of the matrix D
+    rows_below: list[tuple[int, list[Affine]]]  # index and entries of each nonzero row of the factor L below this block
 
 
 class Factors:
@@ -73,7 +73,7 @@ class Factors:
     def _inverse(self, pivots: list[list[Affine]], own_pivots: list[Any]) -> list[list[Affine]]:
         """Return the inverse of a 1x1 or 2x2 pivot block, and append its pivots to `mass_pivots` or `conditions`.
 
-        `own_pivots`: for each row, the pivot it would have if G had no other rows; None: `mass_pivots` gets its pivot.
+        `own_pivots`: a row's pivot as it would be without other rows of G; None if the pivot goes to `mass_pivots`.
         """
         diagonal = [None if pivot is None else pivot.as_term() for pivot in own_pivots]
         a = pivots[0][0]
@@ -155,8 +155,8 @@ def _order_rows(rows: list[dict[int, Affine]], n: int, pairs: Sequence[tuple[int
     """Return the order of elimination of the rows that are not in `pairs`, as tuples of one or two row indices.
 
     The row with the fewest neighbours comes first (minimum degree); neighbours of a row are the columns of its nonzero
-    entries. Two rows with the same neighbours form one tuple. A row of G (index `n` and later) is eliminated after the
-    coordinates in which it has nonzero entries. In a tie, the row with the shortest chain of divisions comes first.
+    entries. Two rows with the same neighbours form one tuple. A row of G (index `n` and later) follows the coordinates
+    in which it has nonzero entries. In a tie, the row whose pivot depends on the fewest successive divisions is first.
     """
     neighbours = [set(row) - {i} for i, row in enumerate(rows)]
     waiting_for = [{j for j in neighbours[i] if j < n} if i >= n else set() for i in range(len(rows))]
@@ -191,8 +191,8 @@ def _eliminate(neighbours: list[set[int]], rows: Sequence[int]) -> set[int]:
 PivotBlocks = Sequence[tuple[tuple[int, ...], tuple[int, ...]]]  # per block: indices of its one or two rows and columns
 Terms = dict[int, Affine]  # nonzero entries of a row of a matrix; keys: column indices
 
-# accelerations are invalid if the square of one of these ratios is below this limit: a pivot / the norm of the entries
-# that it divides; a pivot / the norm of its column; the sine of the angle between the columns of a 2x2 block. A ratio
+# accelerations are invalid if the square of one of three ratios is below this limit: pivot / (norm of the entries that
+# it divides), pivot / (norm of its column), or the sine of the angle between the columns of a 2x2 block. A ratio
 # of 10^-k costs up to 3 k digits. The choice of pivots before a run (linalg/dependent_columns.py) is stricter
 MIN_PIVOT_SQUARE = 0.03**2
 
@@ -262,7 +262,7 @@ class DependentCoordinates:
             self._add_conditions(block, columns, pivot, solved)
 
     def check_length(self, n_following: int = 0) -> None:
-        """Raise ReductionFailed if the operations so far, and `n_following` more, are more than `max_added`."""
+        """Raise ReductionFailed if the operations recorded so far plus `n_following` exceed the limit `max_added`."""
         if len(self._graph.operations) + n_following > self._max_operations:
             raise ReductionFailed
 
@@ -314,9 +314,9 @@ class DependentCoordinates:
 def solve_reduced_system(
     mass: Any, force: Sequence[Affine], coordinates: DependentCoordinates
 ) -> tuple[list[Affine], list[tuple[Affine, Affine]]]:
-    """Return the accelerations a = g + T a_i (`coordinates`: T, g), where T^T M T a_i = T^T (Q - M g); `force`: Q.
+    """Return the accelerations a = g + T a_i, where a_i is the solution of T^T M T a_i = T^T (Q - M g) (Q: `force`).
 
-    Also return pairs of expressions. If the first is larger than the second in each pair, T^T M T is not singular.
+    `coordinates`: T, g. Also return pairs of expressions: T^T M T is not singular if in each pair the first is larger.
     """
     n, T, g, independent = len(mass), coordinates.T, coordinates.g, coordinates.independent
     zero = Affine(mass[0, 0].graph, 0.0, {})
@@ -344,7 +344,7 @@ def _pivot_conditions(matrix: dict[tuple[int, int], Affine], factors: Factors) -
         first_pivot: Affine | None = None
         for i in row_indices:
             pivot = next(pivots)
-            # the second pivot of a block is its determinant, which has the first pivot as a factor: so has `scale`
+            # the second pivot of a 2x2 block is its determinant: compare it with (first pivot) * (diagonal entry)
             scale = matrix[i, i] if first_pivot is None else first_pivot * matrix[i, i]
             first_pivot = pivot
             if pivot.terms:
@@ -376,9 +376,9 @@ def solve_refined(
     `solve`: function that solves linear systems with the matrix [M + S, G^T; G 0], where S is 0, or terms that make
     M definite (see PivotChoice).
 
-    If `choice.is_refined`, a step of refinement improves the solution. Then there is one condition, otherwise none: a
-    pair of expressions. If the first is not larger than the second, refinement has changed a too much, compared with a
-    and (as a is small near equilibrium) with the accelerations that the forces r would cause without constraints.
+    If `choice.is_refined`, a step of refinement improves the solution, and there is one condition, otherwise none. The
+    condition is a pair of expressions; the first must be larger than the second. Otherwise the change by refinement is
+    too large, compared with a and (as a is small near equilibrium) with accelerations due to r without constraints.
     """
 
     def solve_once(r: Sequence[Affine], c: Mapping[int, Affine] | Sequence[Affine]) -> list[Affine]:

@@ -98,7 +98,7 @@ class ParameterTape(SymbolicObject):
             self.parameters[i] = Parameter(float(values[i]), self, 1.0, ((i, 1.0),))
 
     def atom(self, definition: Any) -> Powers:
-        """Return, as Powers, the atom that is defined by ("sum", terms) or by (name of a function, arguments)."""
+        """Return a sum or function as Powers; `definition`: ("sum", terms) or (function's name, arguments)."""
         if definition not in self._atom_indices:
             self._atom_indices[definition] = len(self.atoms)
             self.atoms.append(definition)
@@ -122,7 +122,7 @@ class ParameterTape(SymbolicObject):
     def product_evaluator(self, parameters: Array) -> Callable[[Powers], Any]:
         """Return a function that evaluates Powers (products of powers of atoms: parameters, sums and functions).
 
-        For `parameters` of shape (n_p,) it returns a number, for (n_runs, n_p) an array (n_runs,); but 1.0 for ().
+        For `parameters` (n_p,) it returns a number, for (n_runs, n_p) an array (n_runs,). Empty Powers always give 1.0.
         """
         atoms: dict[int, Any] = {}
         products: dict[Powers, Any] = {(): 1.0}
@@ -275,7 +275,7 @@ def _tape_of(*numbers: float) -> ParameterTape:
 def apply_function(name: str, *arguments: Any) -> Any:
     """Call a function of NumPy or `math` by its name; the result is a Parameter if an argument is a Parameter."""
     name = NUMPY_NAMES.get(name, name)
-    if any(not issubclass(type(x), NUMBER_TYPES) for x in arguments):  # symbols have their own operators
+    if any(not issubclass(type(x), NUMBER_TYPES) for x in arguments):  # let symbols use their own operators
         return OPERATORS[name](*arguments)
     numbers = [x if type(x) is Parameter else float(x) for x in arguments]
     if not any(type(x) is Parameter for x in numbers):
@@ -302,7 +302,7 @@ def _binary_operator(name: str, swapped: bool) -> Callable[[Parameter, Any], Any
         pair = (other, self) if swapped else (self, other)
         if issubclass(type(other), np.ndarray):
             return self.__array_ufunc__(getattr(np, name), "__call__", *pair)
-        if not issubclass(type(other), NUMBER_TYPES):  # not by isinstance(), which symbols refuse
+        if not issubclass(type(other), NUMBER_TYPES):  # symbols refuse isinstance()
             return NotImplemented
         return operation(*(x if type(x) is Parameter else float(x) for x in pair))
 
@@ -342,7 +342,7 @@ def elementwise(function: Callable[..., Any], inputs: Iterable[Any], out: Any = 
 
 
 def _object_array(value: Any) -> Any:
-    # type() instead of isinstance(), which symbols refuse
+    # call type(), because symbols refuse isinstance()
     if issubclass(type(value), np.ndarray):
         return value.astype(object)
     array = np.empty((), dtype=object)

@@ -1,4 +1,4 @@
-"""Programs: operations of traced callbacks, recorded in a graph, and arrays of affine expressions of their results.
+"""Programs: operations that tracing has recorded in a graph, and arrays of affine expressions of the results.
 
 - `Program.run` executes a program in an algebra, which defines what a value is: an array of numbers (`ArrayAlgebra`), a
   value in generated code (`llvm_code.Lowering`), or a polynomial degree (`time_dependence.DegreeAlgebra`).
@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 T = TypeVar("T")
 
 N_COMPARED = 5  # number of states at which a user's traced function is compared with calls of the function
-TIME_SPACING = 0.37  # time (s) between successive compared states; unlikely to be the period of a force
+TIME_SPACING = 0.37  # time (s) between two states at which call and trace are compared; unlikely to be a force's period
 MAX_TRACE_DIFFERENCE = 1e-10  # a trace is wrong if its relative error exceeds this: rounding errors are smaller
 
 # cost of operations by kind, in multiplications; the cost of other operations is not counted
@@ -100,7 +100,7 @@ class Program:
         return self.graph.quantities_for(self.expressions, available)
 
     def cost(self) -> int:
-        """Return the number of multiplications and additions; a reciprocal counts as four, other functions as zero."""
+        """Return the cost of a program in multiplications and additions; see COSTS for the cost of other operations."""
         exprs, total = self.expressions, 0
         for i in self.quantities():
             kind, *_ = self.graph.operations[i]  # type: ignore[misc]
@@ -110,12 +110,12 @@ class Program:
 
     @property
     def sizes(self) -> tuple[dict[str, int], int]:
-        """Return the sizes of the arrays, and the number of conditions."""
+        """Return the number of expressions in each array of the program, by its name, and the number of conditions."""
         return {name: len(exprs) for name, exprs in self.arrays.items()}, len(self.conditions)
 
     @property
     def expressions(self) -> list[Affine]:
-        """Return the list of all expressions in arrays and conditions."""
+        """Return the list of all expressions in the program's arrays and conditions."""
         exprs = [expr for array in self.arrays.values() for expr in array]
         return [*exprs, *(expr for condition in self.conditions for expr in condition)]
 
@@ -123,7 +123,7 @@ class Program:
 class ArrayAlgebra(Algebra[Any]):
     """Algebra in which a value is an array (n_runs,), with one number for each run, or one number for all runs.
 
-    tape : record of how coefficients depend on parameters. parameters : their values, (n_runs, n_p).
+    tape : record of how coefficients depend on parameters. parameters : values of the parameters, (n_runs, n_p).
     """
 
     functions: Mapping[int, Callable[[Any], Any]] = MappingProxyType(
@@ -202,7 +202,7 @@ class OperationTable(NamedTuple):
         )
 
     def as_floats(self) -> list[float]:
-        """Return the table as floats, for the parameters of a model; the results become the first nodes."""
+        """Return the table as floats for bodies/read_tables.py, with nodes renumbered so that results come first."""
         rows = self.rows.copy()
         is_result = rows[:, KIND] == RESULT
         n_results = int(is_result.sum())
@@ -212,7 +212,7 @@ class OperationTable(NamedTuple):
         return [float(x) for part in parts for x in part]
 
     def as_arrays(self, result_indices: Sequence[int]) -> tuple[Any, Any]:
-        """Return the table as integers and floats; `result_indices`: indices of results in a callback's array."""
+        """Return the table as integers and floats; `result_indices`: index of each result in a callback's output."""
         rows, n = self.rows.copy(), len(result_indices)
         rows[rows[:, KIND] == RESULT, NODE] += self.n_nodes
         header = [self.n_nodes + n, len(rows), len(self.columns), n]
@@ -226,7 +226,7 @@ class OperationTable(NamedTuple):
 
 Terms = tuple[tuple[int, float], ...]  # pairs of a quantity and its coefficient
 
-LITERALS = (0.0, 1.0, -1.0)  # coefficients that are part of generated code: they need no multiplication
+LITERALS = (0.0, 1.0, -1.0)  # numbers that generated code need not multiply by; it reads all other numbers from arrays
 LITERAL_TOLERANCE = 8.0 * 2.0**-52  # largest difference between a coefficient and the literal 1 or -1 that replaces it
 
 
@@ -278,13 +278,13 @@ class Coefficients:
 
     @property
     def formulas(self) -> Any:
-        """Return an array of the coefficients (floats or Parameters); it stays the same object until one is added."""
+        """Return an array of the coefficients (floats or Parameters): a new one only if coefficients were added."""
         if len(self._formulas) != len(self._values):
             self._formulas = number_array(self._values)
         return self._formulas
 
     def indexed_terms(self, terms: Terms, constant: float = 0.0) -> tuple[Terms, float]:
-        """Return terms and a constant, with each number replaced by a literal (0, 1, -1) or a Coefficient."""
+        """Return `terms` and `constant`; a Coefficient, which has an index, replaces each number except 0, 1 and -1."""
         key = tuple((i, rounded(c)) for i, c in terms), rounded(constant)
         numbers = self._indexed_terms.get(key)
         if numbers is None:

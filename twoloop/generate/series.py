@@ -38,19 +38,19 @@ class Sums(NamedTuple):
     column: Integers  # for each expression, the index of the quantity in its first term
     coefficient: Array  # for each expression, the coefficient of its first term
     constant: Array  # for each expression, its constant
-    row: Integers  # for each further term, the index of its expression; in `rows` and `balance`, of the equation
-    further_column: Integers  # for each further term, the index of its quantity
-    further_coefficient: Array  # for each further term, its coefficient
+    row: Integers  # for each term after an expression's first term, the index of the expression; see `_nonzero_sums`
+    further_column: Integers  # for each term after an expression's first term, the index of the quantity in this term
+    further_coefficient: Array  # coefficients of all terms after an expression's first term
 
 
 @dataclass(frozen=True)
 class OperationGroups:
     """Operations in groups, in the order of their computation; their results are consecutive quantities.
 
-    groups : array with a row for each group: the kind of its operations; begin and end of the operations; begin and end
-        of their entries in the further_... arrays of `first`, then in those of `second`. A group has operations of one
-        kind, such as SINE, that do not need the results of each other. Sines and cosines of the same angles form one
-        group. The last group contains products with quantities that each order solves for: v, lam and a.
+    groups : array; each row describes a group by its kind, and by (begin, end) of its operations, of the further terms
+        of `first` (see Sums), and of those of `second`. The operations of a group are of one kind, such as SINE, and do
+        not need the results of each other. Sines and cosines of the same angles form one group. The last group has the
+        products with v, lam or a: their coefficients are known only after the linear system of an order is solved.
     first, second : first and second argument of each operation.
     """
 
@@ -65,8 +65,9 @@ class SeriesProgram:
 
     early : operations that depend on t and q only; after them, the products in G v.
     late : operations that depend on v, too; after them, the products in G^T lam + M a.
-    rows, row_indices : nonzero rows of G v + (C_t, b), and their indices. Terms "constant times v_i" are left out.
-    balance, balance_indices : likewise for Q - G^T lam - M a; terms with "constant times" lam_i or a_i are left out.
+    rows, row_indices : nonzero rows of G v + (C_t, b), and their indices. Terms "constant times v_i" are left out,
+        because the linear system of each order has them on its left-hand side.
+    balance, balance_indices : nonzero rows of Q - G^T lam - M a, without "constant times lam_i or a_i", and indices.
     traced : traces of the callbacks, for a comparison with calls; None: nothing is compared.
     """
 
@@ -194,11 +195,11 @@ def _sum_of_products(
     products: dict[Any, Any],
     of_rates: bool,
 ) -> Affine:
-    """Return rest + sum_i factors[i] multipliers[i]; add products that this sum needs to the dict `products`.
+    """Return rest + sum_i factors[i] multipliers[i]; store new products for this sum in the dict `products`.
 
     There are two ways: (1) terms with equal factors share a product; (2) each factor is split into its quantities, and
     terms with the same quantity share a product. The way that adds fewer products is taken. If both add equally many,
-    way (2) is taken for G v + (C_t, b) (`of_rates`), where (cos x) x' costs nothing beside sin x; otherwise way (1).
+    way (2) is taken for G v + (C_t, b) (`of_rates`), because series of sin x need (cos x) x' anyway; otherwise way (1).
     """
     total = rest
     by_factor: dict[Any, tuple[Affine, Affine]] = {}
@@ -225,7 +226,7 @@ def _sum_of_products(
 
 
 def _normalized_product(factor: Affine, multiplier: Affine) -> tuple[Any, float, Affine, Affine]:
-    """Write factor * multiplier as scale * first * second, where scale is a number; return (key, scale, first, second).
+    """Return (key, scale, first, second): factor * multiplier = scale * first * second; `key` is for first * second.
 
     Products that differ only by the number `scale` have equal keys, so that one operation computes them.
     """
@@ -296,7 +297,7 @@ def _needed_operations(graph: Graph, exprs: list[Affine]) -> list[tuple[int, Any
 
 
 def _nonzero_sums(exprs: list[Affine], places: dict[int, int]) -> tuple[Sums, Integers]:
-    """Return the nonzero expressions as Sums, and their indices in `exprs`; `row` in the Sums contains such indices."""
+    """Return the nonzero expressions as Sums, and their indices in `exprs`; Sums.row has indices in `exprs`, too."""
     indices = [k for k, expr in enumerate(exprs) if expr.terms or expr.constant]
     sums = _convert_to_sums([exprs[k] for k in indices], places)
     index_array = np.array(indices, dtype=np.int64)

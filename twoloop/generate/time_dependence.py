@@ -32,11 +32,11 @@ TIME_CALLBACKS = ("force", "constraint_rate", "nonholonomic_rate")  # callbacks 
 STATE_CALLBACKS = ("force", "mass", "constraint", "jacobian", "nonholonomic")
 SMOOTH_OPERATIONS = (PRODUCT, SUM, SINE, COSINE)  # a function of time with another operation may have short pulses
 MAX_DEGREE = 8  # polynomials in time, or in sines and cosines, of a higher degree may have short pulses
-MAX_DEGREE_OF_STATE = 32  # polynomials in q and v of a higher degree, and their roots, may have short pulses
-MAX_DEGREE_OF_DIVISOR = 4  # a quotient may have short pulses if its divisors have a higher total degree in q and v
+MAX_DEGREE_OF_STATE = 32  # polynomials in q and v of a higher degree, or square roots of these, may have short pulses
+MAX_DEGREE_OF_DIVISOR = 4  # a quantity may have short pulses if the degrees of its divisors in q and v add up to more
 FASTEST_DECAY = -2.0  # a quantity may have short pulses if it decays as x^p with p below this value, like 1 / (1 + x^4)
 MAX_RATE = 4.0  # a force may be steep if it has a sine or cosine of x, and dx/dq or dx/dv is larger than this
-# larger systems are not traced for this analysis: tracing may take ten times as long as sampling the forces
+# systems with more coordinates than this are not traced: tracing may take ten times as long as sampling the forces
 MAX_COORDINATES = 300
 TIME_MASK = 1  # a quantity depends on t (input 0 of the graph) if this bit is 1 in its entry of `Graph.input_masks`
 
@@ -153,9 +153,10 @@ class GrowthExponents(DegreeAlgebra):
 
 
 class DivisorDegrees(DegreeAlgebra):
-    """Algebra whose values are total degrees of divisors: a product adds the degrees, a sum takes the largest one.
+    """Algebra whose values are sums of the degrees of all divisors in a quantity, such as 2 + 1 for 1 / x^2 / (1 + y).
 
-    `degrees`: degrees of all quantities. Arctangents of x count as divisions by x: their derivative is x' / (1 + x^2).
+    In a sum of terms, only the largest value counts. Arctangents of x count as divisions by x: their derivative is
+    x' / (1 + x^2). `degrees`: algebra that has computed the degrees of all quantities.
     """
 
     def __init__(self, degrees: DegreeAlgebra):
@@ -163,7 +164,7 @@ class DivisorDegrees(DegreeAlgebra):
         self._degrees = degrees
 
     def operation(self, kind: int, first: Affine, second: Affine | None) -> float:
-        """Return the total degree of the divisors in the result of an operation."""
+        """Return the sum of the degrees of all divisors in the result of an operation."""
         degree = super().operation(kind, first, second)
         return degree + self._degrees.affine(first) if kind in (RECIPROCAL, ARCTANGENT) else degree
 

@@ -265,7 +265,7 @@ TRACING_ORDER = (
     *("constraint", "constraint_rate", "jacobian", "nonholonomic", "nonholonomic_rate", "mass", "force"),
     *("gamma", "nonholonomic_gamma"),
 )
-# keys: callbacks for gamma. Values: the two callbacks (C_q and C_t, or A and b) whose derivatives yield gamma, too
+# keys: callbacks for gamma. Values: the two callbacks (C_q and C_t, or A and b) whose derivatives also give gamma
 GAMMA_SOURCES = {"gamma": ("jacobian", "constraint_rate"), "nonholonomic_gamma": ("nonholonomic", "nonholonomic_rate")}
 
 
@@ -288,7 +288,7 @@ class Equations:
         self._results_before_copy: dict[str, Any] = {}  # in a copy: results of callbacks that the original has traced
 
     def trace_all(self) -> "Equations":
-        """Trace all callbacks of the system that can be traced, so that copies need not trace them; return self."""
+        """Trace all callbacks that run on symbols, so that copies of this object reuse the traces; return self."""
         for kind in TRACING_ORDER:
             if not self._is_derived(kind):
                 with suppress(Untraceable):  # if a callback is needed, `expressions` raises Untraceable again
@@ -328,7 +328,7 @@ class Equations:
         return self._gamma(*GAMMA_SOURCES[kind], self.v if v is None else v)
 
     def _derive_or_trace(self, kind: str, v: Sequence[Affine]) -> Any:
-        """Return the trace of the callback `kind`; if the system does not have it, derive C_q and gamma from others."""
+        """Return the result of the callback `kind`; without this callback, derive C_q or gamma from other callbacks."""
         if self._is_derived(kind):
             return self.derivatives(kind, v)
         if kind in self._results_before_copy and v is self.v:
@@ -341,7 +341,7 @@ class Equations:
         return kind not in self.system.given and kind in ("jacobian", *GAMMA_SOURCES)
 
     def _trace_callback(self, kind: str, v: Sequence[Affine]) -> Any:
-        """Run a callback on symbols and return its result as expressions; zeros if it is missing."""
+        """Run a callback on symbols and return its result as expressions; return zeros if there is no such callback."""
         system, graph, (out,) = self.system, self.graph, self.system.arrays_of(kind)
         out, shape, p = out.astype(object), out.shape, self.parameters.copy()
         arrays = [symbol_array({"q": self.q, "v": v}[name]) for name in KINDS[kind].state]
@@ -373,7 +373,7 @@ class Equations:
         return jacobian
 
     def _gamma(self, rows: str, rates: str, v: Sequence[Affine]) -> Any:
-        """Return gamma = -d/dt(R v + r), v constant; `rows`: callback for R (C_q or A); `rates`: for r (C_t or b)."""
+        """Return gamma = -d/dt(R v + r) at constant v. `rows`: callback for R (C_q or A); `rates`: for r (C_t or b)."""
         direction = {only_quantity(coordinate): u for coordinate, u in zip(self.q, v, strict=True)}
         total_derivative = Derivative(self.graph, {only_quantity(self.t): Affine(self.graph, 1.0, {}), **direction})
         gamma = self.expressions(rates)
@@ -425,25 +425,26 @@ class TraceCache:
     """Cache of traces, and of results derived from traces, for all systems that share their callbacks.
 
     parameters : parameters of one of the systems.
-    classes : class of each parameter. 0: the parameter is a constant in the traces. 1, 2, ...: number of a class, whose
+    groups : group of each parameter. 0: the parameter is a constant in the traces. 1, 2, ...: number of a group, whose
         parameters have equal magnitudes; with a minus sign if the parameter is negative.
     Fields:
-    parameters : parameters with which callbacks are traced: Parameters with random values, and constants.
+    parameters : what callbacks get as parameters during a trace: the numbers of group 0 unchanged, and in place of
+        each other number a Parameter with a random value, which is the same in the whole group except for its sign.
     traced_kinds : names of callbacks that were traced, so they do not branch, and always write to the same entries.
     within_bounds : names of traced callbacks that were found, for one of the systems, to use no index out of bounds.
     """
 
-    def __init__(self, parameters: Array, classes: NDArray[np.int64]):
-        self._classes = classes
-        size = int(np.abs(self._classes).max(initial=0))
-        _, first = np.unique(np.abs(self._classes), return_index=True)
-        self._first_of_class = first[self._classes[first] != 0]  # index of the first parameter in class 1, 2, ...
+    def __init__(self, parameters: Array, groups: NDArray[np.int64]):
+        self._groups = groups
+        size = int(np.abs(self._groups).max(initial=0))
+        _, first = np.unique(np.abs(self._groups), return_index=True)
+        self._first_of_group = first[self._groups[first] != 0]  # for each group, the index of its first parameter
         self._tape = ParameterTape(np.random.default_rng(7).uniform(*GENERIC_RANGE, size).tolist(), range(size))
-        self.parameters = parameters.astype(object) if self._classes.any() else parameters.copy()
-        for i in np.flatnonzero(self._classes).tolist():
-            signed_class = int(self._classes[i])
-            parameter = self._tape.parameters[abs(signed_class) - 1]
-            self.parameters[i] = parameter if signed_class > 0 else -parameter
+        self.parameters = parameters.astype(object) if self._groups.any() else parameters.copy()
+        for i in np.flatnonzero(self._groups).tolist():
+            signed_group = int(self._groups[i])
+            parameter = self._tape.parameters[abs(signed_group) - 1]
+            self.parameters[i] = parameter if signed_group > 0 else -parameter
         self.traced_kinds: set[str] = set()
         self.within_bounds: set[str] = set()
         self._results: dict[Any, Any] = {}
@@ -459,8 +460,8 @@ class TraceCache:
         return traced.copy()
 
     def magnitudes(self, parameters: Array) -> Array:
-        """Return the magnitudes of the parameters in the classes 1, 2, ... (see TraceCache), one for each class."""
-        return np.abs(parameters[self._first_of_class])
+        """Return the magnitude of the parameters in each of the groups 1, 2, ... (equal magnitudes, see TraceCache)."""
+        return np.abs(parameters[self._first_of_group])
 
     def product_evaluator(self, parameters: Array) -> Callable[[Powers], Any]:
         """Return a function that evaluates products of powers (type `Powers`) for the `parameters` of one system."""
@@ -476,7 +477,7 @@ class TraceCache:
             scales, indices, products = self._scaled_products(array)
             with np.errstate(all="ignore"):
                 values: Array = scales * np.array(list(map(product, products)))[indices]
-            if not np.isfinite(values).all():  # for example by division by a sum of parameters that is 0
+            if not np.isfinite(values).all():  # for example after a division by a sum of parameters that is 0
                 raise Untraceable("a number of them is not finite for these parameters")
             return values
 
@@ -561,14 +562,14 @@ def shared_cache(system: ConstrainedSystem) -> TraceCache:
 
 
 def trace_cache_of(system: ConstrainedSystem) -> TraceCache:
-    """Return the TraceCache of all systems with equal compiled callbacks, sizes, parameter classes and constants."""
+    """Return the TraceCache for systems with equal callbacks, sizes, constant parameters and `_parameter_groups`."""
     parameters = system.parameters
-    classes = _parameter_classes(parameters)
-    fixed_parameters = parameters[classes == 0] + 0.0  # -0.0 becomes 0.0, so that keys with zeros are equal
-    key = (*system.given.items(), system.n_q, system.n_c, system.n_a, classes.tobytes(), fixed_parameters.tobytes())
+    groups = _parameter_groups(parameters)
+    fixed_parameters = parameters[groups == 0] + 0.0  # -0.0 becomes 0.0, so that keys with zeros are equal
+    key = (*system.given.items(), system.n_q, system.n_c, system.n_a, groups.tobytes(), fixed_parameters.tobytes())
     cache: TraceCache | None = _TRACE_CACHES.get(key)
     if cache is None:
-        _TRACE_CACHES[key] = cache = TraceCache(parameters, classes)
+        _TRACE_CACHES[key] = cache = TraceCache(parameters, groups)
     return cache
 
 
@@ -577,25 +578,25 @@ def _own_cache(system: ConstrainedSystem) -> TraceCache:
     return TraceCache(system.parameters, np.zeros(system.parameters.size, dtype=np.int64))
 
 
-def _parameter_classes(parameters: Array) -> NDArray[np.int64]:
-    """Return the class (see TraceCache) of each parameter: 0 for constants; equal magnitudes have the same number."""
+def _parameter_groups(parameters: Array) -> NDArray[np.int64]:
+    """Return the group of each parameter: 0 for constants; equal magnitudes share a group. For signs see TraceCache."""
     magnitudes = np.abs(parameters)
     varies = (magnitudes > MIN_MAGNITUDE) & (magnitudes < 1.0 / MIN_MAGNITUDE) & (magnitudes != np.floor(magnitudes))
     _, first, inverse = np.unique(magnitudes[varies], return_index=True, return_inverse=True)
     rank = np.empty(len(first), dtype=np.int64)
     rank[first.argsort()] = np.arange(1, len(first) + 1)
-    classes = np.zeros(len(magnitudes), dtype=np.int64)
-    classes[varies] = np.copysign(rank[inverse], parameters[varies])
-    return classes
+    groups = np.zeros(len(magnitudes), dtype=np.int64)
+    groups[varies] = np.copysign(rank[inverse], parameters[varies])
+    return groups
 
 
 class ParameterArrays:
-    """Arrays of numbers that stand for arrays of expressions; `write` overwrites them by values for new parameters."""
+    """Arrays of numbers that stand for arrays of expressions; `write` updates the numbers for new parameters."""
 
     def __init__(self) -> None:
-        # keys: id of an array of expressions. Values: this array, stored so that no other gets its id, and its numbers
+        # keys: ids of arrays of expressions. Values: the array (stored to keep its id unique), and its array of numbers
         self._arrays: dict[int, tuple[Any, Array]] = {}
-        # for each array: its numbers (flat); indices of varying entries; slice of `values` in `write` for these entries
+        # (array of numbers, indices of entries that `write` overwrites, slice of `values` in `write` with new entries)
         self._number_arrays: list[tuple[Array, NDArray[np.int64], slice]] = []
         self._products: dict[Powers, int] = {}
         self._scales: list[float] = []
@@ -603,7 +604,7 @@ class ParameterArrays:
         self._gathered_products: tuple[list[Powers], Array, NDArray[np.int64]] | None = None
 
     def array(self, exprs: Any) -> Array:
-        """Return the array of numbers that always stands for `exprs`; return `exprs` if it contains only numbers."""
+        """Return the one array of numbers that stands for `exprs`; if `exprs` contains only numbers, return `exprs`."""
         if exprs.dtype != object:
             return exprs  # type: ignore[no-any-return]
         if id(exprs) not in self._arrays:
@@ -628,7 +629,7 @@ class ParameterArrays:
         return numbers.reshape(exprs.shape)
 
     def write(self, product: Callable[[Powers], Any]) -> None:
-        """Store the values of all expressions in the arrays; `product`: result of TraceCache.product_evaluator."""
+        """Store values for new parameters in all arrays that `array` returned; `product`: see `product_evaluator`."""
         if self._gathered_products is None:
             return
         products, scales, product_indices = self._gathered_products

@@ -33,10 +33,10 @@ N_NEARBY = 8  # before a run, calls and traces are compared at the start, and at
 RELATIVE_TIMES = np.linspace(0.0, 1.0, N_NEARBY)  # times of the random states, from 0 (start of the run) to 1 (its end)
 NEARBY_DISTANCE = 0.3  # largest distance of a random position from the start, relative to the sizes of the coordinates
 MAX_STATES_OF_CHUNK = 32  # a `Sample` takes at most about this number of states from one chunk of steps
-MAX_STATES = 64  # a comparison uses at most about this number of states, a `Sample` at most this number of chunks
+MAX_STATES = 64  # largest number of states in a comparison, and of chunks of steps from which a `Sample` keeps states
 MAX_STATES_IN_PYTHON = 9  # replaces MAX_STATES if the callbacks are called in Python
-MAX_ENTRIES = 20_000  # fewer states are compared in large systems: (states) * (results per state) is about this at most
-# the scale of rounding errors of a callback: the largest bound of its rounding errors, divided by EPS (see checks.py)
+MAX_ENTRIES = 20_000  # so few states are compared that (states) * (results per state) does not much exceed this
+# the scale of a callback's rounding errors: the largest bound on errors of its results, divided by EPS (see checks.py)
 ROUNDING_DIFFERENCE = 16.0 * np.finfo(float).eps  # differences up to this * (scale of rounding errors) are harmless
 CLEAR_DIFFERENCE = 1e-6  # a trace is wrong if a difference exceeds this * (scale of rounding errors), or is systematic
 # `_is_systematic` compares call and trace at N_NEIGHBOURS states, at most PERTURBATION (relative) from a given state
@@ -89,7 +89,7 @@ class CallbackTraces:
         refuse_wrong_traces([self], system, t0, t1, q, v)
 
     def check_near_start(self, system: ConstrainedSystem, nearby: Array) -> None:
-        """Compare calls and traces at states `nearby`; raise Untraceable if they differ, else update `is_trusted`."""
+        """Compare calls and traces at states near a start; if they differ, raise Untraceable, else set `is_trusted`."""
         difference = None
         for states in (nearby, *nearby[:, None, :]):  # take all states at once; if a call raises, one by one
             try:
@@ -105,7 +105,7 @@ class CallbackTraces:
     def difference(self, system: ConstrainedSystem, states: Array, everywhere: bool = True) -> str | None:
         """Return a message about the first difference of calls and traces at states [t, q, v], or None if they agree.
 
-        If `everywhere`, the trace must not be finite where a call returns NaN or inf; otherwise ignore such values.
+        If `everywhere`, the trace must not be finite where a call returns NaN or inf; if not `everywhere`, it may be.
         """
         from twoloop.kernels.evaluation import checks as kernels
 
@@ -124,7 +124,7 @@ class CallbackTraces:
         else:
             is_agreeing |= ~finite
         largest = np.where(np.isfinite(bounds), bounds, 0.0).max(axis=0)
-        # for each entry, the scale of rounding errors of its callback is the largest bound of the callback's entries
+        # the scale of an entry is the largest bound on rounding errors among all entries of its callback
         scales = np.repeat(np.maximum.reduceat(largest, np.cumsum(self.n_entries) - self.n_entries), self.n_entries)
         for k, entry in np.argwhere(~is_agreeing & ~(differences <= ROUNDING_DIFFERENCE * scales)):
             if not differences[k, entry] <= CLEAR_DIFFERENCE * scales[entry] or self._is_systematic(
@@ -169,7 +169,7 @@ class CallbackTraces:
 
 
 class Sample:
-    """States [t, q, v] of a run, not always all, for the comparison after the run; `n`: length of [q, v]."""
+    """All or some states [t, q, v] of a run, to compare callbacks with their traces later; `n`: length of [q, v]."""
 
     def __init__(self, t: float, state: Array, n: int) -> None:
         self._n, self._chunks = n, list[Array]()
@@ -215,7 +215,7 @@ Check = Callable[[CallbackTraces], None]  # function that compares traces with c
 
 
 def accept_traces(traced: CallbackTraces) -> None:
-    """Accept traces without a comparison: the `Check` for results that yield no motion, or that are compared later."""
+    """Accept traces without a comparison with calls, for traces that compute no motion or are compared later."""
 
 
 def states_near_start(t0: float, t1: float, q: Array, v: Array) -> Array:
@@ -233,7 +233,7 @@ def states_near_start(t0: float, t1: float, q: Array, v: Array) -> Array:
 
 @cache
 def _random_directions(n_q: int) -> Array:
-    """Return random numbers between -1 and 1, the same in every call: for q, then for v, an array (N_NEARBY, n_q)."""
+    """Return random numbers between -1 and 1, always the same: an array (2, N_NEARBY, n_q), [0] for q and [1] for v."""
     return np.random.default_rng(6).uniform(-1.0, 1.0, (2, N_NEARBY, n_q))
 
 

@@ -28,6 +28,7 @@ SOLVER_SCALE = 1e3  # factor on the equations, so that their gradients exceed th
 MAX_SOLVER_ITERATIONS = 1000
 MAX_LOAD_ITERATIONS = 200  # largest number of fixed-point iterations for the loads that bound the friction
 LOAD_TOLERANCE = 1e-10  # change of the loads that ends the fixed-point iteration, relative to the largest load
+UNIT_RATIO = 256.0  # units of forces are powers of this number, so that they are all 1 for similar bodies
 MAX_OUTSIDE = 1e-9  # largest component of b outside the range of D that counts as rounding, relative to max|b|
 CLOSING_TOLERANCE = 1e-6  # largest acceleration (or rate) with which a stop may still close, relative to max|c|
 SLIDING_TOLERANCE = 1e-9  # largest acceleration that counts as rounding, relative to the sum of its terms
@@ -99,9 +100,23 @@ def coulomb_forces(D: Array, c: Array, limit: Array, tangents: Tangents) -> tupl
     """Return forces x (of stops, of joints at rest, of friction at stops), and the directions in which stops slide.
 
     The forces of stops are non-negative and complementary to the accelerations (or velocities) D x + c. Friction
-    opposes sliding with its coefficient times the force of the stop; at rest, this product is a bound. A fixed-point
-    iteration finds the bounds. Once it is known which contacts slide, stick or open, the equations are linear.
+    opposes sliding with its coefficient times the force of the stop; at rest, this product is a bound.
     """
+    # forces of light and heavy bodies are found in units in which they are similar; a stop and its friction share one
+    n_tangents = len(tangents.normal)
+    units = np.where(D.diagonal() > 0.0, D.diagonal(), 1.0) ** -0.5
+    units[len(c) - n_tangents :] = units[tangents.normal]
+    units = UNIT_RATIO ** np.round(np.log2(units) / np.log2(UNIT_RATIO))
+    n = len(c) - len(limit) - n_tangents
+    x, slides = _forces_in_units(D * units * units[:, None], units * c, limit / units[n : n + len(limit)], tangents)
+    x *= units
+    if (D @ x + c)[:n].min(initial=0.0) < -CLOSING_TOLERANCE * np.abs(c).max(initial=0.0):
+        raise Undetermined("stops push against each other: no motion opens all of them or keeps them closed")
+    return x, slides
+
+
+def _forces_in_units(D: Array, c: Array, limit: Array, tangents: Tangents) -> tuple[Array, NDArray[np.int64]]:
+    """Find bounds of friction by a fixed-point iteration; then contacts slide, stick or open: equations are linear."""
     n_tangents = len(tangents.normal)
     n = len(c) - len(limit) - n_tangents
     tangent_rows = np.arange(len(c) - n_tangents, len(c))
@@ -120,8 +135,6 @@ def coulomb_forces(D: Array, c: Array, limit: Array, tangents: Tangents) -> tupl
     else:
         raise Undetermined("friction of stops is so large that their forces are not determined: they may jam")
     acceleration, terms = D @ x + c, np.abs(D) @ np.abs(x) + np.abs(c)
-    if acceleration[:n].min(initial=0.0) < -CLOSING_TOLERANCE * np.abs(c).max(initial=0.0):
-        raise Undetermined("stops push against each other: no motion opens all of them or keeps them closed")
     if not n_tangents:
         return x, np.zeros(0, dtype=int)
     acceleration_signs = np.sign(acceleration) * (np.abs(acceleration) > SLIDING_TOLERANCE * terms)

@@ -61,7 +61,7 @@ from twoloop.kernels.linalg.dense import copy
 
 SUDDEN_ERROR = 10.0  # a force is assumed to jump within a rejected step whose error, in tolerances, exceeds this
 MAX_RATIO_AFTER_REJECTION = 0.95  # the next step size is at most this times the size of a rejected step
-FIRST_JUDGED_STEP = 2  # a trial judges a method by step sizes from this accepted step on: the first size is a guess
+FIRST_JUDGED_STEP = 2  # number of accepted steps before a trial judges proposed step sizes: the first size is a guess
 
 
 @kernel(i8(KIT, WORK, f8, VECTOR))
@@ -77,7 +77,7 @@ def start(f, w, t, state):
         code = find_tangents(f, w, t, q)
     if code == DONE:
         code = accelerations(f, w, t, q, v, state[2 * n : 3 * n], state[3 * n :])
-    # the allowed error of Gamma by finite differences depends on the size of Gamma, now known: compute Gamma again
+    # the size of Gamma, which sets the allowed error of finite differences for Gamma, is now known: compute Gamma again
     if code == DONE and f.gamma_given == 0:
         code = accelerations(f, w, t, q, v, state[2 * n : 3 * n], state[3 * n :])
     return code
@@ -99,9 +99,9 @@ def _locate_rate_jump(f, w, t, size, tolerances, accepted, state, new_state):
 
 @merged
 def _attempt_step(f, w, options, memory, tolerances, control, clock, t, size, crosses_jump, state, new_state):
-    """Attempt a step; return a code (DONE: no failure), the error in tolerances, and next size / `size` (0: unknown).
+    """Attempt a step; return a code, the step's error in tolerances, and (next step size) / size, or 0 if unknown.
 
-    If `crosses_jump`, no step is computed: `new_state` already contains the state after a jump of C_t or b.
+    If `crosses_jump`, compute nothing: `new_state` is the state after a jump of C_t or b. Code DONE: no failure.
     """
     w.orientation_new = 0.0
     if clock[at.FAILURE_CODE] == DONE:
@@ -124,10 +124,10 @@ def _attempt_step(f, w, options, memory, tolerances, control, clock, t, size, cr
 
 @merged
 def _must_repeat_at_jump(f, w, tolerances, control, clock, t, size, accepted, state, new_state):
-    """Return True if a step must be repeated, so that it ends at a jump or steep ramp of C_t or b within it.
+    """Return True if a step must be repeated with another end, because C_t or b jumps or has a steep ramp in the step.
 
-    For a jump, store the times just before and after it in clock[JUMP_FROM] and clock[JUMP_TO]. For a ramp, which
-    matters only if the step was `accepted`, store the next step size in clock[H_NEXT].
+    For a jump, store the times just before and after it in clock[JUMP_FROM] and clock[JUMP_TO]. A ramp matters
+    only if the step was `accepted` and its size is not fixed. For a ramp, store the next step size in clock[H_NEXT].
     """
     kind, low, high = _locate_rate_jump(f, w, t, size, tolerances, accepted, state, new_state)
     if kind == JUMP:
@@ -143,7 +143,7 @@ def _must_repeat_at_jump(f, w, tolerances, control, clock, t, size, accepted, st
 
 @merged
 def _handle_failure(f, w, control, clock, t, size, code, t_repeated, state):
-    """Prepare to repeat a step that failed with `code`; return CONTINUE, or an end code if it cannot be repeated.
+    """Prepare to repeat a step that failed with `code`, and return CONTINUE; or return a code that ends `advance`.
 
     A step is repeated with a smaller size, a new partition, or both. A step of fixed size is repeated only once, with a
     new partition. `t_repeated`: time (s) from which a step of fixed size was last repeated.
@@ -177,8 +177,8 @@ def _handle_failure(f, w, control, clock, t, size, code, t_repeated, state):
 def _handle_rejection(f, w, control, clock, t, size, proposed_size, state):
     """After a step with too large an error, store the size (s) of its repetition in clock[H_NEXT]; return CONTINUE.
 
-    Return an end code instead if the step is short and a singular position is near. `proposed_size`: size (s) that the
-    error allows.
+    If the step is short and a singular position is near, return a code that ends `advance`. `proposed_size`: size (s)
+    that the error allows.
     """
     n = w.Q.size
     w.n_rejected_error += 1
@@ -329,7 +329,7 @@ def advance(
         error *= error_factor
         if factor == 0.0:
             factor = step_size_ratio(control, clock, size, error)
-        elif error_factor > 1.0 and error > 0.0:  # the method ignored `error_factor`: `factor` may be too large
+        elif error_factor > 1.0 and error > 0.0:  # limit the method's `factor`, which ignores `error_factor`
             factor = min(factor, max(control[FACTOR_MIN], control[SAFETY] * error ** -control[EXPONENT]))
         proposed_size = min(size * factor, clock[at.H_LIMIT])
         if not accepted and factor > 1.0:

@@ -35,7 +35,7 @@ from twoloop.kernels.data.indices import DEFECT_GAP, GAP, MAX_GAP_RATIO, N_COUNT
 from twoloop.kernels.evaluation.checks import CONSISTENT, DEFINITE, INDEFINITE, WELL_FORMED
 from twoloop.kernels.linalg.dense import copy
 
-ROUNDING = 1e-15  # rounding error of a position, relative to max|q|; if corrections are smaller, C_q is kept
+ROUNDING = 1e-15  # rounding error of a position, relative to max|q|; smaller corrections do not require a new C_q
 
 
 @merged
@@ -74,8 +74,8 @@ FIRST_STEP = 0.01  # first step size, relative to the shortest time scale of the
 MIN_FIRST_STEP = 1e4  # smallest first step size, in spacings of floating-point numbers at the start time
 MIN_GAP = 40.0  # the allowed time between evaluations is at least this number of spacings of floating-point times
 SHORTEST_STEP = 1e-16  # a run fails if a step would be shorter than this fraction of the first step
-# if forces may change suddenly with q or v, the allowed time (s) between two evaluations of the equations is this many
-# times shorter in steps that check their defect (DEFECT_GAP) than in other steps (GAP)
+# GAP is the longest allowed time (s) between evaluations; DEFECT_GAP replaces it in steps that check their defect. If
+# forces may change suddenly with q or v, DEFECT_GAP is GAP / GAP_RATIO; if not, both times are equal
 GAP_RATIO = 10
 
 
@@ -83,8 +83,8 @@ GAP_RATIO = 10
 def _first_step_size(state, n, t, span, smallest):
     """Return the first step size (s): FIRST_STEP times the shortest time scale of the motion from `state` [q, v, a].
 
-    The time scales are the run's duration `span` (s), the times in which v or a changes q by max(max|q|, `smallest`),
-    and the time in which a changes v by max|v|. The step has at least MIN_FIRST_STEP spacings of times at t.
+    The time scales are the run's duration `span` (s), x / max|v| and sqrt(x / max|a|) with x = max(max|q|, `smallest`),
+    and max|v| / max|a|. The step is at least MIN_FIRST_STEP floating-point spacings at t.
     """
     distance, speed, acceleration = smallest, 0.0, 0.0
     for j in range(n):
@@ -103,10 +103,10 @@ def _first_step_size(state, n, t, span, smallest):
 
 @exact
 def _set_step_limits(control, tolerances, t, t1, longest, within):
-    """Store the largest step size, and the longest times between evaluations of the equations and samples of forces.
+    """Store three limits: of the step size, of the time between evaluations, and of the time between samples of forces.
 
-    Evaluations are at most MAX_GAP_RATIO * (t1 - t) s apart, which also limits the step size. If the method adds
-    evaluations within long steps (`within` is True), only `longest` (s) limits the step size.
+    Evaluations (of the equations) are at most MAX_GAP_RATIO * (t1 - t) s apart, which also limits the step size. If the
+    method adds evaluations within long steps (`within` is True), only `longest` (s) limits the step size.
     """
     max_gap = max(MAX_GAP_RATIO * (t1 - t), MIN_GAP * np.spacing(max(abs(t), abs(t1))))
     tolerances[GAP], tolerances[DEFECT_GAP] = max_gap, max_gap / (GAP_RATIO if control[at.BY_STATE] > 0.0 else 1.0)
@@ -140,9 +140,8 @@ def split_steps(steps, counts, h, changes, used_newton):
     """Split `steps`, the records of steps (rows of out_steps, see loop_state.py), into arrays with one entry per step.
 
     `h` receives the step sizes (s), `used_newton` True for steps by Newton's method. The three rows of `changes` count
-    events since the previous step: rejections by the error test, failed steps, and new partitions.
-    On entry, `counts` contains how many of these events happened before the first step of `steps`, since the start of
-    the run; on return, how many happened until the last step.
+    events since the previous step: rejections by the error test, failed steps, and new partitions. `counts` contains
+    the numbers of these events since the start of the run: on entry, before the first step; on return, after the last.
     """
     for k in range(h.size):
         h[k], used_newton[k] = steps[k, at.H], steps[k, at.JACOBIANS] > 0.0
@@ -188,30 +187,30 @@ RUN_ARRAYS.add_function("advance", i8(KIT, WORK, *(VECTOR,) * 9, MATRIX, MATRIX,
 # indices in `constants`, the settings of runs; G are the constraint rows [C_q; A]
 (
     ACCURACY,  # initial w.gamma_required: allowed relative error of gamma, if finite differences yield it
-    REUSE,  # initial w.reuse: after a smaller correction of positions, the inner loop does not evaluate C_q again
+    REUSE,  # initial w.reuse: after a correction of q of at most this, the inner loop does not evaluate C_q again
     NEARLY_SINGULAR,  # initial w.nearly_singular. 0: short steps trigger checks for singular positions; 1: they do not
     HAS_ALL_ENTRIES,  # 1: the array `kinds` shows all entries of G that may be nonzero; 0: search for them at the start
     RANK_LIMIT,  # a row of G is redundant if its part orthogonal to previous rows is at most this fraction of its norm
     WEAK_LIMIT,  # M counts as singular if the ratio of its smallest to its largest eigenvalue is below this
     ADDED_SCALE,  # factor s: for a singular M, generated code uses M + s g^T g instead, where g are some rows of G
     CONTRADICTS,  # a start is refused if a residual of G a = gamma exceeds this times max(1, sum of |terms| in the row)
-    MASS_FLAG,  # a start is refused unless the check of M returns this: DEFINITE, INDEFINITE, or 0 for a constant M
+    MASS_FLAG,  # flag that M must have, or the start is refused: DEFINITE, INDEFINITE; 0: M is constant, without a flag
     LEAST_PIVOT,  # a start is refused if the smallest pivot of C_q at the start is below this
     EQUATION_FORM,  # initial f.form, the algebra that solves for accelerations
-    FIRST_SIZE,  # first step size (s) that the user has chosen; 0: it is computed
-    LEAST_DISTANCE,  # argument `smallest` of _first_step_size, the displacement that replaces a smaller max|q|
+    FIRST_SIZE,  # first step size (s) chosen by the user; 0: `_first_step_size` computes it
+    LEAST_DISTANCE,  # argument `smallest` of _first_step_size, where max|q| counts as at least this
     LONGEST,  # longest step (s): argument `longest` of _set_step_limits
     EVALUATES_WITHIN,  # 1: the method adds evaluations within long steps; 0: it does not, which limits the step size
     NEAR_PIVOT,  # Python must check a run if, at an output time, (smallest / largest pivot of C_q) is below this
-    MAX_CHANGE_RATIO,  # velocities jump in a step if max|change| exceeds this * (step size) * max|a| at both ends
-    MIN_SAMPLES,  # Python must check a run if sudden changes of a force, C_t or b are less than this many samples apart
+    MAX_CHANGE_RATIO,  # v jumps in a step if max|change of v| > this * (step size) * (smaller max|a| of the two ends)
+    MIN_SAMPLES,  # Python must check a run if two sudden changes of a force, C_t or b are closer than this many samples
 ) = range(18)
-# indices in `expected`, the choice of constraint rows for which code was generated (empty without generated code)
+# indices in `expected`, which lists the constraint rows that generated code uses (empty without generated code)
 (
-    BOUND,  # index of the pivot limit in MIN_PIVOTS (generate/elimination.py); OF_PYTHON: only Python can check pivots
+    BOUND,  # generated code needs pivots above MIN_PIVOTS[this] (elimination.py); OF_PYTHON: Python must choose rows
     N_ROWS,  # number of independent rows
     N_ADDED,  # number of rows g that are added to a singular M as s g^T g
-    FIRST_ROW,  # index at which two lists begin: first the indices of independent rows, then those of the added rows g
+    FIRST_ROW,  # from this index on, `expected` lists the independent rows, then the rows g added to M as s g^T g
 ) = range(4)
 OF_PYTHON = 100
 
@@ -262,7 +261,7 @@ def _start_run(f, checked_kit, w, b, t, t1, q, v, records, checks):
     """Check and prepare the start of a run from t to t1; return 0 if the run may begin, else a code such as REFUSED.
 
     `checked_kit`: kit with the user's callbacks, which check the start (callbacks of `f` may be derived from them).
-    `checks`: what Python has checked, such as STATE_CHECKED. `records`: data of earlier positions (`evaluate_start`).
+    `checks`: what Python has checked, such as STATE_CHECKED. `records`: earlier positions, see `evaluate_start`.
     """
     n = q.size
     if not (finite_vector(q) and finite_vector(v)):
@@ -276,7 +275,7 @@ def _start_run(f, checked_kit, w, b, t, t1, q, v, records, checks):
     )
     if has_all_entries:
         pattern = b.pattern.reshape(b.pattern.size)
-        for k in range(b.kinds.size):  # for each entry of [C_q; A]: kind 0 if it is always zero
+        for k in range(b.kinds.size):  # b.kinds[k] is 0 if entry k of [C_q; A] is always zero
             pattern[k] = 1.0 if b.kinds[k] != 0 else pattern[k]
     if flags & WELL_FORMED == 0 or flags & (DEFINITE | INDEFINITE) != int(b.constants[MASS_FLAG]):
         return REFUSED
@@ -329,12 +328,13 @@ def _restore_start(b):
 
 N_EQUAL = 0  # last_start[N_EQUAL]: number of successive runs from the last start, counted up to 2
 START = 1  # last_start[START:]: the last start, [t, t1, q, v], where t1 is the end of the run
-NEVER, IS_SAVED = 0.0, 2.0  # if last_start[N_EQUAL] is NEVER, the last start is not reused; IS_SAVED: it is in `saved`
+# values of last_start[N_EQUAL]. NEVER: the last start must not be reused. IS_SAVED: its data are stored in b.saved
+NEVER, IS_SAVED = 0.0, 2.0
 
 
 @exact
 def _equals_last_start(last_start, t, t1, q, v):
-    """Return True if the start (t, t1, q, v) equals the last one bit for bit; store it as the last one."""
+    """Return True if the start (t, t1, q, v) equals the last start bit for bit; store it as the last start."""
     n, is_same = q.size, last_start[N_EQUAL] > NEVER
     for k in range(2 + 2 * n):
         x = t if k == 0 else t1 if k == 1 else q[k - 2] if k < 2 + n else v[k - 2 - n]
@@ -356,7 +356,7 @@ def _equals_last_start(last_start, t, t1, q, v):
     LONGEST_GAP,  # longest time (s) between two evaluations of the equations
     END_CODE,  # code that `advance` returned
     IS_NEW,  # 1: the start differs from the start of the previous run; 0: both are equal
-    N_REPORT,  # index of the first counter (of steps, rejections, evaluations, ...)
+    N_REPORT,  # number of entries above; counters (of steps, rejections, evaluations, ...) begin at this index
 ) = range(11)
 N_HEAD = N_REPORT + N_COUNTERS  # length of the report with counters, without times and steps
 

@@ -25,8 +25,9 @@ MAX_VELOCITY_ROUNDING = 10.0
 # is below SINGULAR_PIVOT, or below SINGULAR_PIVOT_RATIO times the larger ratio at the ends of its interval
 SINGULAR_PIVOT_RATIO = 0.01
 SINGULAR_PIVOT = 1e-5
-# a position is also singular if its pivot ratio r is below WEAK_PIVOT, and r * (change of v by projection, in units of
-# the tolerances) is below MAX_VIOLATION: this product is about the violation removed, perhaps due to rounding only
+# a position also counts as singular if its pivot ratio r is below WEAK_PIVOT, and r * (change of v by the projection,
+# in tolerances) is below MAX_VIOLATION. This product estimates the violation of the constraints by v before the
+# projection. So small a violation may consist of rounding errors, which the projection amplifies by 1 / r
 MAX_VIOLATION, WEAK_PIVOT = 10.0, 0.05
 
 
@@ -36,7 +37,7 @@ def _node_range(low, high, i, last):
 
     The interval is in the middle of these states, unless an index would be below `low` or above `high`.
     """
-    if last > i + 1:  # `fill_intervals` has added states within the interval: interpolate only its own states
+    if last > i + 1:  # `fill_intervals` has added states within the interval: interpolate only states i to `last`
         return i, last
     n_states = min(kinds.WINDOW, high - low + 1)
     lo = max(low, min(i + 1 - n_states // 2, high + 1 - n_states))
@@ -47,10 +48,10 @@ def _node_range(low, high, i, last):
 def _divided_differences(t, states, lo, hi, i, h, column, order, z, c):
     """Compute the Hermite polynomials through rows lo to hi of `states`; return the number of coefficients of each.
 
-    There are n polynomials, for the n columns of `states` from index `column` on. The next n columns contain the first
-    derivatives, and the next n columns the second derivatives. Row i is subtracted from the values. `order`: 2 to
-    interpolate values and first derivatives, 3 to interpolate second derivatives, too. Store the coefficients of
-    Newton's form in c, and the interpolated times in z, as (time - t[i]) / h; h: duration of the interval.
+    There are n polynomials, for the n columns of `states` from index `column` on, minus their values in row i. The next
+    n columns contain the first derivatives, and the next n columns the second derivatives. `order`: 2 to interpolate
+    values and first derivatives, 3 to interpolate second derivatives, too. Store the coefficients of Newton's form in
+    c, and the time of each coefficient, as (time - t[i]) / h, in z; h: duration of the interval.
     """
     n = c.shape[1]
     n_coefficients = (hi - lo + 1) * order
@@ -74,10 +75,10 @@ def _divided_differences(t, states, lo, hi, i, h, column, order, z, c):
 
 @merged
 def _evaluate_polynomials(states, i, kind, h, s, z, c, size, z_v, c_v, size_v, q, v):
-    """Store in q and v the values of the polynomials of an interval at the time t[i] + s h; h: duration.
+    """Store in q and v the values of the polynomials of an interval at the fraction s of its duration h.
 
-    (z, c, size): interpolated times, coefficients and their number, for the polynomials of q. If `kind` is SEPARATE,
-    (z_v, c_v, size_v) describe polynomials of v; otherwise v is the derivative of the polynomials of q.
+    (z, c, size): times, coefficients and number of coefficients of the polynomials of q, see `_divided_differences`. If
+    `kind` is SEPARATE, (z_v, c_v, size_v) belong to polynomials of v; otherwise v is the derivative of those of q.
     """
     n = q.size
     for m in range(n):
@@ -212,7 +213,7 @@ def interpolate_states(f, w, tolerance, tolerances, t, states, groups, times, z,
 
 @merged
 def _state_difference(tolerances, scale_q, scale_v, states, i, q, v, q_other, v_other):
-    """Return the largest scale_q |q - q_other| or scale_v |v - v_other|, in units of the tolerances for state i."""
+    """Return the largest of scale_q |q_other - q| and scale_v |v_other - v|, relative to tolerances at states[i]."""
     n = q.size
     rtol, largest, total = tolerances[RTOL], 0.0, 0.0
     for m in range(n):
@@ -220,7 +221,7 @@ def _state_difference(tolerances, scale_q, scale_v, states, i, q, v, q_other, v_
         change_q = scale_q * abs(q_other[m] - q[m]) / (atol + rtol * abs(states[i, m]))
         change_v = scale_v * abs(v_other[m] - v[m]) / (atol + rtol * abs(states[i, n + m]))
         largest, total = max(largest, change_q, change_v), total + change_q + change_v
-    # `total` is not finite if two interpolated states have equal times, as after a step no longer than rounding of t
+    # if two interpolated states have equal times (a step may be as short as rounding of t), `total` is not finite
     return largest if np.isfinite(total) else np.inf
 
 
@@ -256,14 +257,14 @@ def _has_similar_gaps(t, lo, hi):
 def estimate_errors(f, w, tolerance, tolerances, t, states, groups, z, coefficients, rows, out):
     """For each interval g of `groups`, store in out[g] the estimated error of its polynomials, in tolerances.
 
-    There are three estimates (`tolerance`: of the projection; z, coefficients, rows: scratch):
-    - 0, if the kind is SEPARATE or VELOCITIES, and the polynomials interpolate more than two states, which are about
-      equally spaced and not inside the interval
-    - otherwise, with more than two states: the change of the polynomials when the last state is not interpolated. It is
-      used if it is at most 1, or if the kind is VELOCITIES, whose accelerations contain noise of stiff modes
-    - otherwise, the larger of two differences at CHECKED_FRACTIONS: between a state before and after its projection;
-      and between accelerations by the polynomials and by the equations of motion. With dt = h / (number of
-      coefficients), dt times the second difference counts as an error of v, and dt^2 times it as an error of q
+    `tolerance`: tolerance of the projection; z, coefficients, rows: scratch. The first estimate that applies is used:
+    - 0 for the kinds SEPARATE and VELOCITIES, if polynomials interpolate more than two states, all of them outside the
+      interval or at its ends, and if the steps between these states are about equally long (MAX_GAP_RATIO)
+    - the difference from polynomials that leave out the last state, if there are more than two states. If it exceeds 1,
+      use the next estimate, except for VELOCITIES, where accelerations contain noise of stiff modes
+    - the larger of two differences at CHECKED_FRACTIONS: between the state before and after projection, and between
+      accelerations by polynomials and by the equations of motion. Let dt be h / (number of coefficients): a difference
+      of accelerations times dt counts as an error of v, and times dt^2 as an error of q
     """
     n = w.Q.size
     half = z.size // 2

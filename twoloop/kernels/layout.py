@@ -16,7 +16,7 @@ from twoloop.kernels.linalg.markowitz_lu import MAX_ENTRIES_PER_LINE, N_COUNTS, 
 
 # at most MAX_UNUSED unused workspaces are kept for later runs, each with at most MAX_UNUSED_SIZE floats
 MAX_UNUSED, MAX_UNUSED_SIZE = 32, 100_000
-WORD, LINE = 8, 8  # WORD: bytes in a number; LINE: numbers in a cache line, at the start of which an array begins
+WORD, LINE = 8, 8  # WORD: bytes in a number; LINE: numbers in a cache line. Arrays begin at the start of a cache line
 
 
 class FixedOrderSizes(NamedTuple):
@@ -29,9 +29,9 @@ class FixedOrderSizes(NamedTuple):
     dense_jacobian: bool  # True: the entries of C_q are copied from a full matrix, which a callback fills
 
 
-# arguments of _create_layout: numbers of coordinates, of rows of C_q, of rows of A (non-holonomic); ranks of C_q and of
-# [C_q; A]; True to allocate the arrays of the null-space form; True to allocate those of the augmented form; number of
-# nodes of traced programs; FixedOrderSizes, or None in other forms; length of the array `matrices`
+# arguments of _create_layout: numbers of coordinates, of constraints C = 0, of non-holonomic constraints A v + b = 0;
+# ranks of C_q and of [C_q; A]; whether to allocate arrays of the null-space form; whether to allocate arrays of the
+# augmented form; length of the array `nodes`; FixedOrderSizes, or None in other forms; length of the array `matrices`
 Sizes = tuple[int, int, int, int, int, bool, bool, int, FixedOrderSizes | None, int]
 ArrayRanges = list[tuple[str, int, int, tuple[int, ...]]]  # for each array: name, first offset, end, shape
 
@@ -97,11 +97,11 @@ def _allocate_workspace(sizes: Sizes) -> Work:
 
 
 def keep_unused_workspace(work: Work) -> None:
-    """Keep a workspace for later runs unless it is large; of more than MAX_UNUSED, discard those used longest ago."""
+    """Keep a small workspace for later runs. If more than MAX_UNUSED are kept, discard those used longest ago."""
     unused = _unused_workspaces.pop(work.sizes, [])
     if work.notes.base.size <= MAX_UNUSED_SIZE and len(unused) < MAX_UNUSED:
         unused.append(work)
-    # insert these sizes at the end of the dictionary: so it begins with the sizes that were used longest ago
+    # insert these sizes at the end of the dictionary. The sizes used longest ago, at its beginning, are discarded first
     _unused_workspaces[work.sizes] = unused
     for oldest in list(_unused_workspaces)[:-1]:
         if sum(map(len, list(_unused_workspaces.values()))) <= MAX_UNUSED:

@@ -17,6 +17,7 @@ Array = NDArray[np.float64]
 NEAR = 1e-9  # times count as equal if they differ by at most this, relative to the duration of the run
 ROUNDING = 1e-9  # deviation attributed to rounding, relative to the largest acceleration or multiplier
 SINGULAR_START = 1e-5  # largest error of the accelerations at a start in a singular position, relative to the largest
+LIMIT_OF_A = 10.0  # a and lam may be off by what errors of this many tolerances in the stored state can cause
 PATTERNS = 3  # number of sign patterns of the perturbations by which the effect of a tolerance is measured
 
 
@@ -50,7 +51,7 @@ def field_faults(result: Record, system: ConstrainedSystem, rtol: float, atol: A
         return
     yield from _times_and_steps(result)
     yield from _start_faults(result, system, rtol, atol, limit)
-    yield from _acceleration_faults(result, system, rtol, atol, limit)
+    yield from _acceleration_faults(result, system, rtol, atol)
 
 
 def _wrong_shapes(result: Record, system: ConstrainedSystem) -> Iterator[str]:
@@ -102,12 +103,10 @@ def _start_faults(result: Record, system: ConstrainedSystem, rtol: float, atol: 
         yield f"the first velocities violate the constraints by {violation.max():.2g}"
 
 
-def _acceleration_faults(
-    result: Record, system: ConstrainedSystem, rtol: float, atol: Array, limit: float
-) -> Iterator[str]:
+def _acceleration_faults(result: Record, system: ConstrainedSystem, rtol: float, atol: Array) -> Iterator[str]:
     """Yield clauses about stored a and lam that deviate from the solution of the equations at the stored states.
 
-    A deviation is allowed if errors of `limit` tolerances in the state can cause it; perturbed states measure this.
+    A deviation is allowed if errors of LIMIT_OF_A tolerances in the state can cause it; perturbed states measure this.
     """
     n, t = system.n_q, np.ascontiguousarray(result.t)
     states, stored = np.vstack([result.q, result.v]).T.copy(), np.vstack([result.a, result.lam]).T
@@ -148,7 +147,7 @@ def _acceleration_faults(
     magnitudes = np.concatenate(
         [np.full(n, largest[:n].max(initial=0.0)), np.full(len(largest) - n, largest[n:].max(initial=0.0))]
     )
-    allowed = limit * effect + ROUNDING * magnitudes
+    allowed = LIMIT_OF_A * effect + ROUNDING * magnitudes
     with np.errstate(invalid="ignore"):
         deviation = np.abs(stored - exact)
         is_wrong = np.isfinite(exact) & ~(deviation <= allowed)

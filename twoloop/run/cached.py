@@ -80,7 +80,7 @@ N_FIRST_CHUNKS = 4
 N_SKIPPED_CALLS = 16  # after an exception in a callback, this number of calls do not use the cached integrator
 STEP_FIELDS = (*STEP_ARRAYS, "stats")  # fields of a result that are computed from the array of steps
 NON_STEP_DEFAULTS = {name: value for name, value in DEFAULTS.items() if name not in STEP_FIELDS}
-SHORT_RUN = 1e-3  # if the last run took less CPU time (s), measure elapsed time: its clock is read faster
+SHORT_RUN = 1e-3  # if the last run took less CPU time (s) than this, measure elapsed time, which is read faster
 HARMLESS = 0.01  # v0 need not satisfy the constraints exactly: projection may change v0 by this number of tolerances
 REACHED_END = Status.REACHED_END  # a global name is read faster than a member of an Enum
 
@@ -89,9 +89,9 @@ STEPS = OutputRequest()  # request for output at the ends of all steps, without 
 
 @dataclass(frozen=True)
 class RepeatRequest:
-    """Result of a run that may have missed short changes of forces: the caller must repeat it."""
+    """Result of a run that may have missed short changes of forces: the caller must repeat the run."""
 
-    max_gap: float  # longest time (s) that the repetition allows between two evaluations
+    max_gap: float  # longest time (s) allowed between two evaluations in the repeated run
     cpu_time: float  # CPU time of the run to be repeated (s)
 
 
@@ -125,8 +125,8 @@ class CachedIntegrator:
         self.evaluation, self.loops, self.code, self.skips = StartEvaluation(checked), cached_run(), code, 0
         self.arrays, self.callbacks = arrays_of(run, self.evaluation, code, definite, options, n_attempts), checked.kit
         self._start_and_advance = entry_point(self.loops.start_and_advance)
-        # `arrays.block` contains a report (numbers about the run, times, steps), which ends at the index states_begin,
-        # then the states. A report on one state and no step begins at one_state_begin, longer reports before this index
+        # `arrays.block` contains a report (numbers about the run, times, steps) up to the index states_begin, and
+        # states after it. A report on one state and no step begins at one_state_begin; longer ones begin earlier
         self.states_begin, self.width = self.arrays.report.size, len(run.state)
         self.one_state_begin = self.states_begin - self.loops.N_HEAD - 1
         self.loop_used = False  # True: `IntegrationLoop` may have changed attributes that `_return_to_start` restores
@@ -162,7 +162,7 @@ class CachedIntegrator:
     ) -> dict[str, Any] | RepeatRequest | None:
         """Integrate a system from a start, if possible by one call of compiled code; return one of three results.
 
-        A dict: fields of the result; `later` is a function that computes other fields when they are read. A
+        A dict: fields of the result; its key "later" has a function that computes missing fields when they are read. A
         RepeatRequest: the run may have missed short changes of forces. None: the start needs more checks, or a callback
         has raised an exception; `set_up`, called next by the caller, checks the start and names the problem.
         """
@@ -196,7 +196,7 @@ class CachedIntegrator:
             return None
         self.cpu_time = clock() - began
         fields: dict[str, Any] = {"status": REACHED_END}
-        n_rows, timed_states = n, None  # n: number of steps and of states after the start; if negative, a code
+        n_rows, timed_states = n, None  # n steps were taken, and n states stored; n < 0: a code such as REFUSED
         rows_differ = run.rows_warning != "" and (rows := arrays.start_rows.tobytes()) != self.independent_rows
         if rows_differ and n >= 0 and rows in self.redundancy:
             self._use_independent_rows(rows)
@@ -241,8 +241,8 @@ class CachedIntegrator:
 
         If the loop continued, or a check failed, return what `integrate` has to return: fields, a RepeatRequest, or
         None. Otherwise store `sol` in `fields` if it is requested, and return a tuple with one element: the pair
-        (output times, states), or None if output is at the ends of all steps. `is_due`: whether callbacks must be
-        compared with their traces at all sampled states, even if earlier runs did so near these states.
+        (output times, states), or None if output is at the ends of all steps. `is_due`: whether to compare callbacks
+        with their traces at all sampled states. If False, compare only at states far from those of earlier comparisons.
         """
         run, arrays, loops = self.run, self.arrays, self.loops
         n_rows, n_steps = arrays.filled.tolist()
@@ -307,7 +307,7 @@ class CachedIntegrator:
         """Before the next run, restore attributes of `run` (other than arrays) that the last run may have changed."""
         run, self.loop_used = self.run, False
         if run.plan is self.attributes_at_start["plan"] and not run.substituted and run.kit.flags[FORM] == self.form:
-            # keep the kit of the last run: if `IntegrationLoop` has loaded a step of this plan, only this kit calls it
+            # keep the last run's kit: kits made before `IntegrationLoop` loaded a step cannot call this step
             self.attributes_at_start["kit"] = run.kit
         vars(run).update(self.attributes_at_start, crossings=[], jumps=[], sizes_to_try=[], substituted=False)
 
@@ -318,7 +318,7 @@ class CachedIntegrator:
         def states(all_states: bool) -> Array:
             sample = Sample(float(t[0]), rows[0], n)
             sample.add(t[1:], rows[1:], float(t[-1]), rows[-1])
-            # also check the states with extreme t, q or v: then a repetition of this run lies in the checked region
+            # include the states with extreme t, q or v: then the checked region contains the whole run
             return sample.states() if all_states else np.concatenate([extreme_states(t, rows[:, :n]), sample.states()])
 
         checks = t1, self.check_derivatives, REACHED_END, "", is_due, is_inside
@@ -340,14 +340,14 @@ def fields_of(
 def _deferred_field(
     data: Array,  # copy of the report on a run: numbers, times, steps and states
     timed_states: tuple[Array, Array] | None,  # output times and states; None: output at the ends of all steps
-    run_fields: tuple[int, NDArray[np.int64], bool],  # rank; redundant rows; whether steps called generated code
+    run_fields: tuple[int, NDArray[np.int64], bool],  # rank of G; redundant rows; whether steps called generated code
     cpu_time: float,
     system: ConstrainedSystem,
     t1: float,
     options: Options,
     name: str,
 ) -> dict[str, Any]:
-    """Compute the field `name` of a result when it is first read; return a dict of all fields computed together."""
+    """When the field `name` of a result is first read, return a dict of this field and others from the same data."""
     if name == "message":
         return {name: describe_arrival(t1, options.step_size is not None)}
     loops, n_states, n_steps = cached_run(), int(data[0]), int(data[1])
@@ -364,7 +364,7 @@ def _deferred_field(
     return NON_STEP_DEFAULTS | state_fields(system.n_q, t, rows) | fields | options.metadata
 
 
-RECHECK_PIVOT = 0.1  # `set_up` checks a start whose smallest pivot of C_q is below this part of the first start's pivot
+RECHECK_PIVOT = 0.1  # `set_up` checks starts with a pivot of C_q below this * (smallest pivot when the run was cached)
 
 
 def arrays_of(
@@ -437,12 +437,11 @@ def arrays_of(
 def _choice_as_array(choice: PivotChoice | None) -> tuple[NDArray[np.int64], float]:
     """Return `choice` as an array of integers for kernels, and the factor s of terms s g^T g added to M (g: row of G).
 
-    The array is empty if `choice` is None. Generated code adds such terms to M, for example if M is singular: so M
-    becomes definite. If nothing is added, s is 1.
+    The array is empty if `choice` is None. Terms are added if M is singular or pivots are small; without terms, s is 1.
     """
     if choice is None:
         return np.zeros(0, dtype=np.int64), 1.0
-    # OF_PYTHON: if solutions are refined, kernels cannot repeat this choice at a new start: Python must choose rows
+    # OF_PYTHON: if code refines its solutions, only Python, no kernel, can choose rows and pivots at a new start
     index = cached_run().OF_PYTHON if choice.is_refined else int(np.searchsorted(-MIN_PIVOTS, -choice.min_pivot))
     numbers = index, len(choice.rows), len(choice.added_rows), *choice.rows, *choice.added_rows
     return np.array(numbers, dtype=np.int64), (*choice.scales, 1.0)[0]
@@ -454,14 +453,14 @@ MAX_OPTIONS, MAX_WORKSPACE, MAX_ENTRIES = 16, 150_000, 3
 
 
 class CacheEntry(NamedTuple):
-    """Cached run at its start, and integrators made from it that wait for the next call with the same options."""
+    """Run stored at its start, and integrators made from it that are free for the next call with equal options."""
 
     run: Run
     start: tuple[float, bytes, bytes]  # t0, and the bytes of q0 and v0
     t1: float  # end of the run (s)
     code: GeneratedCode | None
     definite: bool  # whether M was definite at the start
-    for_other_starts: bool  # whether a copy of the run may be moved to another start
+    for_other_starts: bool  # whether copies of the run may begin at other starts
     idle: list[CachedIntegrator] | None  # integrators not in use; None: each run needs `set_up`
     shared: SharedSetup | None = None  # setup for systems that differ only in parameters; None: not shared
 
@@ -525,7 +524,7 @@ def set_up(
     A run is cached if twoloop provides the method, callbacks are compiled, and callbacks agree with their traces. Raise
     TypeError or ValueError if the start is refused, the method cannot run the system, or code cannot be generated.
     """
-    if system.called_in_python:  # not cached: Python functions may depend on variables that change
+    if system.called_in_python:  # do not cache the run: Python functions may depend on variables that change
         return _new_run(system, t0, t1, q0, v0, options)[0], None
     start, key = (t0, q0.tobytes(), v0.tobytes()), options.key
     last_start, runs, last_code = system.derived.get("runs", EMPTY_CACHE)
@@ -594,7 +593,7 @@ def _share_setup(system: ConstrainedSystem, run: Run, code: GeneratedCode | None
 def _copy_for_start(
     entry: CacheEntry, system: ConstrainedSystem, t0: float, t1: float, q0: Array, v0: Array, options: Options
 ) -> Run | None:
-    """Return a copy of a cached run, moved to another start; None if its code or linear algebra is not valid there."""
+    """Return a copy of a cached run for another start; None if its code or linear algebra is not valid there."""
     _check_start(system, t0, q0, v0, options)
     if entry.code is not None and not entry.code.is_valid_from(system, t0, q0):
         return None

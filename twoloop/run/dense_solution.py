@@ -117,7 +117,7 @@ class Interpolator:
         from twoloop.kernels import advance
 
         system, t0, row = self.arguments[:3]
-        self.work.notes[indices.GENERATION] = 1.0  # number of partitions so far; above 0, kernels use `self.ranks`
+        self.work.notes[indices.GENERATION] = 1.0  # number of partitions: unless it is 0, kernels keep `self.ranks`
         state = np.concatenate([row, np.zeros(system.n_c + system.n_a)])
         entry_point(advance.start)(self.kit, self.work, t0, state)
         self.repair_plans: dict[bool, tuple[Plan, Any]] = {}
@@ -300,12 +300,12 @@ class Interpolator:
         n, options = self.system.n_q, crossing_plan(self.system.n_q).options
         times = np.linspace(table.t[i], table.t[i + 1], self.parts + 1)
         states = np.array([state_at(memory, options, t) for t in times])
-        # at both ends, use q and v of the table, but not its accelerations, in which rounding errors may dominate
+        # at both ends of the interval, use q and v of the table, but not a, which may have large rounding errors
         states[[0, -1], : 2 * n] = table.states[i : i + 2, : 2 * n]
         return times, states
 
     def _plan_for_repair(self, kind: int) -> tuple[Plan, Any]:
-        """Return the plan and the kit that divide an interval of this kind into N_REPAIR_STEPS steps."""
+        """Return the plan and the kit for dividing an interval of this kind into N_REPAIR_STEPS steps."""
         is_stiff = kind == indices.VELOCITIES
         if is_stiff not in self.repair_plans:
             from twoloop.methods.dop853 import DOP853
@@ -341,9 +341,10 @@ class Interpolator:
     def _divide_intervals(
         self, table: StateTable, plan: Plan, kit: Any, numbers: Integers
     ) -> dict[float, tuple[Array, Array]]:
-        """Divide the intervals `numbers` (indices) into `plan.parts` steps, or fewer if steps fail.
+        """Divide each interval in `numbers` (indices) into `plan.parts` steps; if one of them fails, into fewer.
 
-        Return a dict: the key is the time at which an interval begins, the value is its (times, states).
+        Return a dict: the key is the time at which an interval begins, the value is its (times, states). Intervals that
+        cannot even be divided into two steps are left out.
         """
         n = self.system.n_q
         state = np.zeros(3 * n + self.system.n_c + self.system.n_a)
@@ -367,7 +368,7 @@ class Interpolator:
     def interior_blocks(self, table: StateTable) -> Iterator[tuple[Array, Array]]:
         """Yield the states within all divided intervals, in blocks, so that the caller can store them in a file.
 
-        A block has times (m, parts + 1) and rows [q, v, a] (m, parts + 1, 3 n_q) of m intervals; unused ones are NaN.
+        A block has times (m, parts + 1) and rows [q, v, a] (m, parts + 1, 3 n_q) of m intervals, padded with NaN.
         """
         intervals = _interval_rows(table, np.arange(len(table.t) - 1))
         for block in _blocks_of_intervals(intervals):
@@ -381,7 +382,7 @@ class Interpolator:
             yield t, states
 
     def restore_interior_states(self, t: Array, states: Array) -> None:
-        """Use states within intervals that were read from a file (see `interior_blocks`); compute no others."""
+        """Use `states` read from a file as states within intervals (see `interior_blocks`); compute no further ones."""
         self.parts, self.may_divide = t.shape[1] - 1, False
         self._allocate_scratch()
         sizes = np.isfinite(t).sum(axis=1).tolist()
@@ -418,7 +419,7 @@ def _interval_rows(table: StateTable, numbers: Integers) -> Integers:
     rows[:, indices.FIRST_OWN], rows[:, indices.LAST_OWN] = numbers, numbers + 1
     rows[:, indices.KIND] = table.kinds[numbers]
     rows[:, indices.HIGH] = len(table.t) - 1
-    # polynomials of steps across a singular position use no states before these steps, where rounding may be large
+    # polynomials across a singular position use no states before the crossing: these may have large rounding errors
     is_crossing = np.append(False, table.kinds == indices.ACROSS)
     (crossing_starts,) = (is_crossing[1:] & ~is_crossing[:-1]).nonzero()
     if crossing_starts.size:
@@ -439,7 +440,7 @@ def _warn_of_lost_rank(consequence: str, stacklevel: int = 4) -> None:
 
 
 class OutputInterpolation:
-    """Interpolation of states at output times, for one run after another by a cached integrator."""
+    """Interpolates states at output times. A cached integrator uses this object for one run after another."""
 
     def __init__(self, run: Run):
         self.run, self._rows = run, np.zeros((0, 0))
@@ -489,7 +490,7 @@ class DenseState:
         Times, s.
     q, v : ndarray (n_q,) or (n_q, n)
         Coordinates and velocities, satisfying the constraints to rounding error. Exception: close to a singular
-        position, where rounding would dominate the velocities, they are not projected, and a warning says so.
+        position, rounding would dominate projected velocities: q and v are not projected, and a warning says so.
     a : ndarray (n_q,) or (n_q, n)
         Accelerations at these times, evaluated when they are first read.
     lam : ndarray (n_c + n_a,) or (n_c + n_a, n)
@@ -503,7 +504,7 @@ class DenseState:
         self.q, self.v = self._columns_by_time(rows[:, :n]), self._columns_by_time(rows[:, n:])
 
     def _columns_by_time(self, rows: Array) -> Array:
-        """Return `rows` (at ascending times) as columns ordered as `self.t`; if `self.t` is a number, the only row."""
+        """Return `rows` (in ascending time) as columns in the order of `self.t`; a vector if `self.t` is a number."""
         columns = np.empty(rows.shape[::-1])
         columns[:, self._order] = rows.T
         return columns if np.ndim(self.t) else columns[:, 0]
@@ -540,9 +541,9 @@ class DenseSolution:
     Some steps are too long for such polynomials: steps of `RungeKutta` of order 6 and more (with Newton's method, of
     order 7 and more), of `Taylor` and of `Lobatto16`, also within `auto`. Each such step is divided into 2 to 6 equal
     steps of the method when a time within it is first evaluated; to divide all steps costs about as much as the run.
-    If a polynomial changes by more than the tolerances without the last of its states, constraints and equations of
-    motion are evaluated at two times in the interval. The polynomial may violate them beside a singular position or a
-    jump of a force. Then three other polynomials are tried: through states of a step across the position; through the
+    If a polynomial changes by more than the tolerances when the last of its states is omitted, it is checked at two
+    times in the interval: it may violate the constraints or equations of motion beside a singular position or a jump of
+    a force. Then three other polynomials are tried: through states of a step across the position; through the
     ends of four steps of `DOP853`, or of a Radau method if Newton's method solved the outer loop; and through the ends
     of the interval only. The statistics of the run do not count these evaluations.
 
@@ -562,7 +563,7 @@ class DenseSolution:
     >>> state = result.sol([0.25, 0.5])
     >>> state.q.shape, state.lam.shape
     ((9, 2), (8, 2))
-    >>> bool(abs(problem.system.constraint(0.25, state.q[:, 0])).max() < 1e-12)  # closed between steps
+    >>> bool(abs(problem.system.constraint(0.25, state.q[:, 0])).max() < 1e-12)  # the loop stays closed
     True
     """
 

@@ -31,13 +31,13 @@ MAX_REPETITIONS = 2  # largest number of repetitions of a run that may have miss
 
 
 def may_have_missed_changes(run: Run, limit: float = REPEAT_BELOW) -> bool:
-    """Return whether the shortest change of forces is below `limit` times the longest time between evaluations."""
+    """Return whether the shortest change of forces is shorter than `limit` * (longest time between evaluations)."""
     a, clock = run.a, run.clock
     return bool(clock[a.SHORTEST_CHANGE] < limit * clock[a.WIDEST_SAMPLING])
 
 
 def gap_for_repetition(run: Run) -> float:
-    """Return the largest time (s) between evaluations for a repetition of a run that may have missed short changes."""
+    """Return the longest allowed time (s) between evaluations when a run that may have missed changes is repeated."""
     a, clock = run.a, run.clock
     return float(max(clock[a.SHORTEST_CHANGE] / EVALUATIONS_PER_CHANGE, clock[a.WIDEST_SAMPLING] / MAX_REFINEMENT))
 
@@ -62,7 +62,7 @@ N_CORRECTIONS = 3  # number of Newton steps that suffice to reduce errors of pos
 NEGLIGIBLE_RATIO = 1e-12
 MAX_SCALINGS = 20  # largest number of iterations of `equilibrating_units`
 N_REFINEMENTS = 2  # number of times that a solution is corrected by the solution for its residual
-MAX_RESIDUAL = 1e-8  # largest residual of a constraint rate after a jump, relative to its terms and the largest jump
+MAX_RESIDUAL = 1e-8  # limit of residual / (sum of |terms| + max|r|) in rows of G dv = r (dv, r: jumps of v, -[C_t, b])
 
 
 def state_after_jump(system: ConstrainedSystem, t: float, q: Array, v: Array) -> Array | None:
@@ -91,7 +91,7 @@ def corrected_positions(system: ConstrainedSystem, t: float, q: Array) -> Array:
 def velocity_changes(mass: Array, rows: Array, impulses: Array, rates: Array) -> Array:
     """Return X (n_q, k) with M X + G^T P = `impulses` (n_q, k) and G X = `rates` (n_rows, k); P is not computed.
 
-    If X is not unique, as without inertia in some direction, it is the least of the scaled solutions.
+    If inertia is missing in some direction, X is not unique: return the X of least norm in `equilibrating_units`.
     """
     kept = independent_rows(rows)
     matrix = np.block([[mass, rows[kept].T], [rows[kept], np.zeros((len(kept),) * 2)]])
@@ -110,10 +110,10 @@ def independent_rows(rows: Array) -> NDArray[np.int64]:
 
 
 def solve_scaled(matrix: Array, right_side: Array, units: Array, is_singular: bool = False) -> Array:
-    """Solve K X = `right_side` (n, k) with K = `matrix` in `units` (n,), see `equilibrating_units`.
+    """Solve K X = `right_side` (n, k) for X (K: `matrix`), after scaling by `units` (n,) of `equilibrating_units`.
 
-    K is factorized by LU, as least squares lose digits of light bodies beside heavy ones. If it is singular, by
-    `is_singular` or to rounding, the least scaled X of least squares is returned.
+    The scaled K is factorized by LU, as least squares lose digits of light bodies beside heavy ones. If `is_singular`,
+    or if K is singular to rounding errors, the least-squares solution of least norm in these units is returned.
     """
     from scipy.linalg.lapack import dgecon, dgetrf, dgetrs
 
@@ -129,11 +129,11 @@ def solve_scaled(matrix: Array, right_side: Array, units: Array, is_singular: bo
 
 
 def equilibrating_units(matrix: Array, n_q: int) -> Array:
-    """Return units u for which the largest entry of each row of u_i K_ij u_j is about 1 (D. Ruiz, RAL-TR-2001-034).
+    """Return units u that scale `matrix` K: the largest entry of each row of u_i K_ij u_j becomes about 1.
 
-    They are not unique, as larger units of velocities and smaller ones of multipliers leave G as it is: for each set of
-    connected bodies, they are those in which the largest entry of M is 1. Units are powers of 2, so that scaling causes
-    no rounding errors.
+    The algorithm is that of D. Ruiz, RAL-TR-2001-034. In K = [M G^T; G 0], larger units of velocities and smaller units
+    of multipliers would leave the scaled G as it is. So, in each set of connected bodies, the units are chosen so that
+    the largest scaled entry of M is about 1. Units are powers of 2, so that scaling causes no rounding errors.
     """
     from scipy.sparse.csgraph import connected_components
 
@@ -156,12 +156,12 @@ def _root_of_inverse(values: Array) -> Array:
     return np.exp2(-np.round(0.5 * np.log2(np.where(values > 0.0, values, 1.0))))
 
 
-# the step sizes tried in turn across a singular position are these ratios times the first size. Larger sizes help if a
-# step ends before the position or too near to it; smaller sizes help if the error of a step is too large
+# the step sizes tried in turn across a singular position are these ratios times the size tried first. Larger sizes help
+# if a step ends before the position or too near to it; smaller sizes help if the error of a step is too large
 SIZE_RATIOS = (1.0, *(1.2**k for k in range(1, 12)), *(0.85**k for k in range(1, 28)))
 LARGEST_RATIO = max(SIZE_RATIOS)
 # if a run comes near a singular position before the time FIRST_STEPS * (longest recent step) has passed, its steps may
-# still be as short as at the start. Then much larger step sizes are also tried: LARGE_RATIOS times the first size
+# still be as short as at the start. Then much larger sizes are also tried: LARGE_RATIOS times the size tried first
 FIRST_STEPS = 30.0
 LARGE_RATIOS = tuple(1.2**k for k in range(12, 30))
 # "distance" of a state from a singular position: (smallest pivot of C_q there) / (largest value of this pivot in the
@@ -170,18 +170,18 @@ FAR_BEFORE = 0.2
 # if no step across a singular position succeeds, the tolerances are multiplied by TOLERANCE_FACTOR, and the longest
 # allowed time between evaluations by GAP_FACTOR (if no forces are short, this time becomes unlimited)
 TOLERANCE_FACTOR, GAP_FACTOR = 10.0, 4.0
-MAX_ATTEMPTS_IN_PYTHON = 200  # largest number of failed steps across a position if Python evaluates the equations
+MAX_ATTEMPTS_IN_PYTHON = 200  # largest number of failed steps across a singular position if callbacks run in Python
 NODE_DISTANCES = 1.0, 0.5, 0.25  # values that are tried in turn for the field `node_distance` of Limits
 
 
 class Limits(NamedTuple):
-    """Limits of a polynomial across a singular position and of its steps; if no step succeeds, wider ones are tried."""
+    """Limits of steps across a singular position and their polynomial; if no step succeeds, wider limits are tried."""
 
     has_wide_gaps: bool  # whether the longest allowed time between evaluations is multiplied by GAP_FACTOR
     may_approach: bool  # whether a step may end before the singular position, but nearer to it than the step began
     tolerance_factor: float  # factor by which the run's tolerances are multiplied in steps across the singular position
-    # factor on the pivot of C_q below which nodes of the polynomial are left out, because their rounding errors are
-    # large. A smaller factor leaves out fewer nodes, which helps if the motion is slow near the singular position
+    # factor on the pivot of C_q below which nodes of the polynomial are left out because of large rounding errors. A
+    # smaller factor leaves out fewer nodes, which helps if the motion is slow near the singular position
     node_distance: float
 
 
@@ -194,8 +194,8 @@ class Origin(NamedTuple):
     may_end_beyond: bool = False  # whether the polynomial may end beyond the end of the run
 
 
-# the search for a state at which the polynomial begins goes back in time. It stops at a state whose distance is less
-# than this fraction of the largest distance found: another singular position is near that state
+# the search for a state at which the polynomial begins goes back in time. It stops near another singular position: at
+# a state whose distance (see FAR_BEFORE) is less than this fraction of the largest distance found before
 MIN_DISTANCE_RATIO = 0.5
 
 
@@ -235,8 +235,8 @@ def renew_kit(run: Run) -> None:
 def cross_singularity(run: Run, past: list[TimedState]) -> tuple[Plan, Array]:
     """Prepare steps across a singular position, see kernels/steps/crossing_step.py; return their plan and settings.
 
-    Set the first step size, and list the polynomials to try in `run.origins`. The settings are the array `control` that
-    `advance` reads. `past`: states of the last accepted steps, oldest first; may be empty.
+    Set the first step size, and store in `run.origins` which polynomials to try. The settings are the array `control`
+    that `advance` reads. `past`: states of the last accepted steps, oldest first; may be empty.
     """
     a, clock = run.a, run.clock
     from twoloop.kernels.steps.crossing_step import BACKWARD_FRACTION, NODE_GAP
@@ -263,7 +263,7 @@ def cross_singularity(run: Run, past: list[TimedState]) -> tuple[Plan, Array]:
     control[: a.N_RULE] = plan.rule
     control[a.SYMMETRIC], control[a.MAY_CROSS], control[a.MAX_ATTEMPTS] = 0.0, 0.0, 1.0
     control[a.MAY_SWITCH] = control[a.TAKES_MANY] = 0.0
-    run.piece_ends = []  # integrators reuse `run`, so that times of an earlier run may be left
+    run.piece_ends = []  # remove the times of an earlier run, for which the same object `run` was used
     if control[a.FIXED_STEP] == 0.0:
         control[a.MAX_EVALUATION_GAP] = 1.0 if run.forces_may_be_steep else NODE_GAP / (1.0 - BACKWARD_FRACTION)
     clock[a.LIMIT_AGE] = 0.0

@@ -107,7 +107,7 @@ class Interrupts:
         """
         if self.handlers is None and raised_by_handler(error):
             return False
-        self.install_handlers()  # if a signal arrives during this call, it may raise an exception
+        self.install_handlers()  # a signal that arrives during this call may raise an exception
         return self._is_installed and self.n_signals <= MAX_STORED_SIGNALS
 
     def restore_handlers(self) -> None:
@@ -149,8 +149,8 @@ CHUNK_TO_EVENT = 16  # attempted steps in a chunk if an event may end the run, b
 CHUNK_TIME = 0.05
 # statuses whose message may say that stability limited the steps
 STATUSES_WITH_STIFFNESS_NOTE = {Status.REACHED_END, Status.EVENT, Status.MAX_STEPS, Status.TIME_LIMIT, Status.STAGNATED}
-# the polynomial across a singular position may begin at one of the last N_RECENT states, or at the end of one of the
-# N_RECENT last long steps (at least COLLAPSED_STEP * clock[H_LONG]) before these, within the last N_LAST_STATES states
+# among the last N_LAST_STATES states, the polynomial across a singular position may begin at the last N_RECENT states
+# and, before these, at the last N_RECENT ends of long steps (COLLAPSED_STEP times the longest recent step, or longer)
 N_RECENT, N_LAST_STATES = 16, 256
 CROSSING_OVERSHOOT = 100.0  # a crossing step may end beyond t1 by at most this multiple of the run's duration
 NO_KINDS = np.zeros(0, dtype=np.int64)  # kinds of intervals if no states between steps are requested
@@ -197,16 +197,16 @@ class IntegrationLoop:
         has_terminal_event = request.events is not None and any(event.terminal < np.inf for event in request.events)
         if has_terminal_event:
             self.largest_chunk = run.chunk = CHUNK_TO_EVENT
-        # progress is checked every `check_interval` attempted steps, next after `next_check` attempted steps in the run
+        # progress is checked every `check_interval` attempted steps; the next check is due after `next_check` attempts
         self.check_interval = self.next_check = run.chunk
         self.plan, self.control, self.kit = run.plan, run.control, run.kit  # replaced while steps cross a singularity
         self.counts = INITIAL_COUNTS.copy()
         self.latest_chunks: list[tuple[Array, Array]] = []  # times and rows of the last chunks, see _last_states
-        self.step_parts = [np.empty((0, run.a.N_STEP_COLUMNS))]  # an empty array, then rows of steps not stored yet
+        self.step_parts = [np.empty((0, run.a.N_STEP_COLUMNS))]  # an empty array, then the steps to be put in `store`
         if self.request.store.append_only:
             self._store_step_fields()
         self.n_filled = np.zeros(2, dtype=np.int64)
-        may_end_before_t1 = has_terminal_event or time_limit is not None  # then t1 may be very large
+        may_end_before_t1 = has_terminal_event or time_limit is not None  # then a very large t1 is no sign of stalling
         self.stall_detector = StallDetector(run.t0, np.inf if may_end_before_t1 else MAX_STEPS_LEFT)
         self.stiffness_monitor = StiffnessMonitor(run.plan)
         self.sample = Sample(run.t0, self.start, 2 * run.system.n_q)
@@ -306,7 +306,7 @@ class IntegrationLoop:
 
     @contextmanager
     def _deadline_timer(self) -> Iterator[None]:
-        """While this context is active, a timer stops machine code at the deadline, if a single step may take long."""
+        """While active, this context stops machine code at the deadline by a timer (not in small compiled systems)."""
         run, notes = self.run, self.run.work.notes
         if self.deadline == np.inf or (run.system.n_q <= SMALL_SYSTEM and not run.system.called_in_python):
             yield
@@ -323,7 +323,7 @@ class IntegrationLoop:
             notes[indices.TIME_IS_UP] = 0.0
 
     def _store_chunk(self, t: Array, rows: Array, steps: Array, kinds: NDArray[np.int64]) -> None:
-        """Record the states (times, rows), steps and kinds of intervals of a chunk."""
+        """Record the states (times, rows) and steps of a chunk, and the kinds of the intervals that the steps cover."""
         run = self.run
         self.sample.add(t, rows, float(run.clock[run.a.T]), run.state)
         self.step_parts.append(steps)
@@ -336,7 +336,7 @@ class IntegrationLoop:
                 self.latest_chunks.pop(0)
 
     def _store_step_fields(self) -> None:
-        """Move data of steps from `self.step_parts` to the store: one array for each name in STEP_ARRAYS."""
+        """Move data of steps from `self.step_parts` to `self.request.store`, one array for each name in STEP_ARRAYS."""
         steps, self.step_parts = np.concatenate(self.step_parts), self.step_parts[:1]
         for name, values in step_fields(steps, self.counts).items():
             self.request.store.add(name, values)
@@ -363,7 +363,7 @@ class IntegrationLoop:
             self.code = INTERRUPTED
 
     def _choose_method(self, in_crossing: bool, n_steps: int) -> None:
-        """If `self.code` asks for another method, form or state, choose it, and set the code to PAUSED to go on."""
+        """Change method, form or state, or compile, as `self.code` asks; if the run goes on, set it to PAUSED."""
         run, a = self.run, self.run.a
         if self.code == a.NEEDS_DENSE or run.may_succeed_in_other_form(self.code):
             run.change_form()
@@ -476,7 +476,7 @@ class IntegrationLoop:
         return record_of(Record, DEFAULTS | fields)
 
     def _suspicious_last_step(self, t: Array, table: Array) -> list[TimedState]:
-        """Return [(t, state) before the last step] if v changed more in it than accelerations explain, else []."""
+        """If velocities jumped in the last step, return a list with the state before this step, else an empty list."""
         run = self.run
         if self.request.times is not None or self.recorder.end_event is not None:
             return []
@@ -485,7 +485,7 @@ class IntegrationLoop:
         return [(float(t[-2]), table[-2])] if has_velocity_jump_at_end(t, table, run.system.n_q) else []
 
     def _suspicious_outputs(self, t: Array, table: Array) -> list[TimedState]:
-        """Return all output states, to be checked, if a step ended at one of them near a singular position, else []."""
+        """Return all output states if steps end at output times and passed near a singular position, else []."""
         run, request = self.run, self.request
         equal_steps = run.control[run.a.FIXED_STEP] > 0.0 and request.times is None
         if not run.passed_near_singular() or not (
@@ -495,7 +495,7 @@ class IntegrationLoop:
         return list(zip(t.tolist(), table, strict=True))
 
     def _next_buffers(self) -> Buffers:
-        """Return buffers for the times, states and steps of a chunk; attempted steps fill at most one row of each."""
+        """Return buffers for times, states and steps of a chunk; an attempted step fills at most one row of each."""
         chunk, width = self.run.chunk, len(self.run.state)
         n_rows, n_steps = max(min(chunk, BUFFER_ROWS), LANES), max(min(chunk, BUFFER_STEPS), LANES)
         spare_buffers = _spare_buffers.pop((n_rows, n_rows * width, n_steps), None)

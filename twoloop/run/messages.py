@@ -63,7 +63,7 @@ class StallDetector:
         self.window_n += len(h)
 
     def is_stalled(self, t: float, t1: float) -> bool:
-        """Return whether too many steps (see StallDetector) are left from t to t1; False until another check is due."""
+        """Return whether a run to t1 is stalled at time t; False for STAGNATION_STEPS steps after the last check."""
         if self.window_n < STAGNATION_STEPS:
             return False
         self.mean_step = (t - self.window_t) / self.window_n
@@ -77,7 +77,7 @@ class StallDetector:
 
 
 MAX_SAMPLES = 8  # largest number of sampled states, spread about evenly over the run
-N_LAST_STEPS = 8  # number of steps before a sampled state; their median is the step size of the sample
+N_LAST_STEPS = 8  # number of steps before a sampled state; the median of their sizes is the step size of the sample
 N_ITERATIONS = 6  # number of power iterations at each sampled state
 # a power iteration starts with the eigenvector at the previous sample, to which INITIAL_FACTOR times a vector without
 # zeros (`initial_direction`) is added, because a component that is zero at the start might stay zero
@@ -85,8 +85,8 @@ INITIAL_FACTOR = 0.1
 # in a power iteration x -> J x, the dominant eigenvalue of J is negative if cos(x, J x) is below minus this number
 MIN_ALIGNMENT = 0.9
 MIN_STEPS = 200  # after fewer accepted steps, a message does not mention stiffness
-# let h be the step size, and `rate` that of the fastest vibration or decay: a method is stable while h * rate <= limit.
-# Stability limited steps if the median of h * rate / limit in all samples is this or more; 0.4 is typical otherwise
+# a method is stable if (step size) * (rate of the fastest vibration or decay) is at most a limit. Stability limits
+# the steps if the median over all samples of (product / limit) is at least this; in other runs, the median is about 0.4
 MIN_STABILITY_RATIO = 0.45
 
 
@@ -172,7 +172,7 @@ def _fastest_rates(kit: Any, work: Any, sample: StiffnessSample, directions: lis
 def _dominant_eigenvalue(
     kit: Any, work: Any, sample: StiffnessSample, direction: Array, independent: NDArray[np.int64], by_v: bool
 ) -> tuple[float, bool]:
-    """Return |x| and whether x < 0, for the dominant eigenvalue x of dF/dq, or dF/dv if `by_v` (F: accelerations).
+    """Return |x| and whether x < 0; x: dominant eigenvalue of dF/dq, or of dF/dv if `by_v` (F: accelerations).
 
     Only the coordinates `independent` (indices) vary. `direction`: first vector of the iteration, then the eigenvector.
     """
@@ -225,7 +225,7 @@ _FAILURE_REASONS = {
 def message_of(run: "Run", text: str, system: "ConstrainedSystem") -> dict[str, Any]:
     """Return {"message": text}, or {"later": function} with a function that completes the text when it is first read.
 
-    A description of the singular positions that the run crossed takes longer than many runs: so a text with such a
+    To describe the singular positions that a run crossed takes longer than many runs: so a text that contains such a
     description is completed later. Until then `system` must not change, but the arrays of the run may.
     """
     if CROSSINGS_MARK not in text:
@@ -242,10 +242,10 @@ def message_of(run: "Run", text: str, system: "ConstrainedSystem") -> dict[str, 
 def reject_velocity_jumps(
     run: "Run", last_step: list[TimedState], output_states: list[TimedState], end: float, status: Status, message: str
 ) -> tuple[Status, str]:
-    """Return RANK_LOST and the reason if rounding or a change of branch changed velocities near a singular position.
+    """Return (RANK_LOST, reason) if rounding or a change of branch made velocities jump near a singular position.
 
-    Else return `status` and `message`. Check states before the time `end`: the states before and after crossed
-    positions, `output_states`, and `last_step` ([state before the last step] if velocities jumped in it, else []).
+    Else return `status` and `message`. Check states before the time `end`: the states before and after crossings,
+    `output_states`, and `last_step` ([state before the last step] if velocities jumped in this step, else []).
     """
     end_state, crossings = (float(run.clock[run.a.T]), run.state), [each for each in run.crossings if each[0][0] < end]
     reason = describe_rounding(run, [*(state for ends in crossings for state in ends), *output_states], end)
@@ -258,9 +258,9 @@ def reject_velocity_jumps(
 
 
 def describe_rounding(run: "Run", states: list[TimedState], end: float) -> str:
-    """Find the earliest of `states` where rounding changes v by more than MAX_LASTING_ERROR tolerances.
+    """Return a sentence on the earliest of `states` where rounding changes v by over MAX_LASTING_ERROR tolerances.
 
-    Return a sentence about this state, or "" if there is no such state. Do not check states at or after the time `end`.
+    Return "" if there is no such state. Do not check states at or after the time `end`.
     """
     system, n = run.system, run.system.n_q
     for t, state in sorted({each[0]: each for each in states}.values(), key=itemgetter(0)):
@@ -420,7 +420,7 @@ def warn_of_singular_end(run: "Run") -> str:
 
 
 def warn_of_inaccurate_crossing(run: "Run") -> str:
-    """Warn if ordinary steps may have passed a singular position inaccurately; return the warning, or "" if none."""
+    """Warn if steps other than crossings may have passed a singular position inaccurately; return the warning or ""."""
     ratio = float(run.clock[run.a.PIVOT_PASSED])
     if ratio == 0.0:
         return ""

@@ -51,7 +51,7 @@ class Options:
 
     @cached_property
     def metadata(self) -> dict[str, Any]:
-        """Fields `method` and `rtol` of a result; also `untested` = None (no step) if steps test velocity errors."""
+        """Fields `method` and `rtol` of a result, and `untested` = None (no step) if all steps test velocity errors."""
         tested = getattr(self.method, "tested", "all")
         return {"method": self.method.name, "rtol": self.rtol} | ({} if tested == "positions" else {"untested": None})
 
@@ -62,7 +62,7 @@ class Options:
             run.set_step_sizes(self.first_step, self.max_step, t1)
 
 
-NO_CALL: Any = (None,) * 12, None  # (12 arguments, options) of the last call, as long as there was none
+NO_CALL: Any = (None,) * 12, None  # stands for (12 arguments, options) of the last call if there was no call yet
 
 
 def options_of(
@@ -80,7 +80,7 @@ def options_of(
     check_derivatives: Any,
     compiled: Any,
 ) -> Options:
-    """Return the validated options of a call; raise TypeError or ValueError if one is wrong.
+    """Return the validated options of a call of `solve_dae`; raise TypeError or ValueError if one is wrong.
 
     If all arguments are the same objects as in the last call, they are not checked again.
     """
@@ -120,7 +120,7 @@ def options_of(
         check_positive("time_limit", time_limit)
     step_options = first_step, float(max_step), max_steps, step_size
     options = Options(method_object, float(rtol), tolerances, *step_options, generates, bool(check_derivatives))
-    if type(atol) is float and is_preset(method):  # other objects may change between calls: do not store them
+    if type(atol) is float and is_preset(method):  # unlike arrays, these cannot change between calls
         arguments = method, rtol, atol, first_step, max_step, max_steps, step_size, dense_output, progress
         system.shared["options"] = (*arguments, time_limit, check_derivatives, compiled), options
     return options

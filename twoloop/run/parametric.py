@@ -94,14 +94,14 @@ class ParametricRun:
         run.kit = kit_for_plan(self.system, run.kit.flags, run.plan)
 
     def use_parameters_of(self, system: ConstrainedSystem) -> bool:
-        """Write the parameters of a system to the arrays; return False if the arrays contained them already."""
+        """Write the parameters of a system to the run's arrays; return False if these arrays contain them already."""
         if system is self.current_system:
             return False
         self._fill_arrays(system)
         return True
 
     def _fill_arrays(self, system: ConstrainedSystem) -> None:
-        """Write the parameters of a system, and the values of all expressions in them, to the arrays of the run."""
+        """Write a system's parameters, and the values of all expressions in these parameters, to the run's arrays."""
         self.current_system = system
         self._functions.p[:] = system.functions.p
         self._expression_arrays.write(self.shared.trace_cache.product_evaluator(self._functions.p))

@@ -99,8 +99,8 @@ class Dependence(NamedTuple):
     """Rank of C_q of a large system at a position, and the rows that depend on others."""
 
     rank: int
-    coefficients: dict[int, Array]  # for each dependent row: x (n_c,) with row = x @ C_q; x is 0 at dependent rows
-    allowed_move: Array  # random displacement (n_q,) that C_q allows; the largest entry is 1 unit of a coordinate
+    coefficients: dict[int, Array]  # for each dependent row: x (n_c,) with row = x @ C_q; x[k] = 0 for dependent rows k
+    allowed_move: Array  # random displacement (n_q,) that C_q allows; max|entry / (unit of coordinate)| = 1
     project_nearby: Callable[[Array], Array | None]  # projects a position near q; returns None on failure
 
 
@@ -254,7 +254,7 @@ def consistent_state(
     keep : sequence of int, optional
         Coordinates whose position and velocity are not changed, such as a crank's. None: all may change.
     check_assembly : bool
-        Whether three other guesses, as far from the constraints as this one, must lead to the same assembly. False:
+        Whether three other guesses, up to twice as far from the constraints, must lead to the same assembly. False:
         accept the position that the projection finds.
 
     Returns
@@ -267,7 +267,7 @@ def consistent_state(
     ------
     TypeError, ValueError
         If a shape is wrong, a value is not finite, `keep` leaves too little freedom, or no consistent position is found
-        near the guess. Also if other guesses, as far away, lead to another assembly, usually near a dead centre.
+        near the guess. Also if a guess up to twice as far away leads to another assembly, usually near a dead centre.
 
     Examples
     --------
@@ -293,7 +293,7 @@ def consistent_state(
 def _project_state(
     system: ConstrainedSystem, t: float, guess: Array, speeds: Array, kept: list[int], check_assembly: bool
 ) -> ConsistentState:
-    """Project a guess (positions and velocities `speeds`); return the state, still without `moved_q` and `moved_v`."""
+    """Project positions `guess` and velocities `speeds`; return the state, still without `moved_q` and `moved_v`."""
     free = np.array([j for j in range(system.n_q) if j not in kept], dtype=int)
     check_bounds(system, t, guess, speeds)
     system.check_returned(t, guess, speeds)
@@ -320,7 +320,7 @@ def _project_state(
 
 
 class _LargeState(ConsistentState):
-    """Consistent state of a large system; its assembly is computed only when read, as that needs full matrices."""
+    """Consistent state of a large system, whose assembly needs full matrices, and is computed only when it is read."""
 
     system: ConstrainedSystem
     t: float
@@ -382,12 +382,12 @@ def _projected_position(
 def _describe_other_assembly(
     system: ConstrainedSystem, t: float, q1: Array, guess: Array, free: NDArray[np.intp], scales: Scales, cutoff: float
 ) -> str | None:
-    """Check whether guesses as far from the projected position q1 as `guess` may lead to another assembly.
+    """Project three guesses near q1; return a phrase about one that may end on another assembly; None if none may.
 
-    Return None if they cannot, or a phrase about one that may. A guess leads to the same assembly if its projection is
-    about the point that C_q predicts to first order, and the determinant of the dependent columns keeps its sign. If
-    not, Newton's method starts from the independent coordinates of q1 and the dependent ones of the projected guess. If
-    this iteration does not lead back to q1, there is another assembly.
+    q1 is the projection of `guess`. The three guesses are at most twice as far from q1 as `guess`. One of them
+    leads to the same assembly if its projection is near the point that C_q predicts to first order, and the determinant
+    of the dependent columns of C_q keeps its sign. Otherwise, Newton's method starts from q1 with the dependent
+    coordinates of its projection. There is another assembly if Newton's method does not lead back to q1.
     """
     scaled_move = (q1 - guess) / scales.columns
     largest_move = float(np.abs(scaled_move).max())
@@ -411,8 +411,8 @@ def _describe_other_assembly(
         expected = q1 + displacement + _least_change(jacobian, free, -(jacobian @ displacement), cutoff)
         if distance(projected, expected) <= MAX_NONLINEARITY * float(np.abs(move).max()) and sign_at(projected) == sign:
             continue
-        # the prediction may be inaccurate only because constraints are curved. Then `mixed`, q1 with the dependent
-        # coordinates of `projected`, is projected back to q1. Otherwise, `projected` is on another assembly
+        # `projected` is on another assembly, or only the curvature of constraints moves it away from `expected`. If it
+        # is only the curvature, Newton's method leads from `mixed` (q1 with dependent entries of `projected`) to q1
         mixed = q1.copy()
         mixed[dependent_columns] = projected[dependent_columns]
         mixed_projected, excess, _ = _gauss_newton(system, t, mixed, np.array(dependent_columns, dtype=int), cutoff)
@@ -516,7 +516,7 @@ def _describe_rank_loss(scales: Scales, jacobian: Array, free: NDArray[np.intp],
 def _describe_no_freedom(
     system: ConstrainedSystem, t: float, scaled: Array, free: NDArray[np.intp], kept: list[int], why: str
 ) -> str:
-    """Return the message of a projection that fails because columns of C_q lack rank; `why`: what remains violated."""
+    """Return the message for a failed projection if columns of C_q lack rank; `why`: phrase about the violation."""
     ranks = f"rank {_rank(scaled[:, free])} of {len(scaled)}"
     name = "C_q" if len(scaled) == system.n_c else "[C_q; A], whose rows contradict one another at these velocities,"
     if not kept:

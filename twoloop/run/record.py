@@ -116,7 +116,7 @@ def read_arrays(folder: Path) -> dict[str, NDArray[Any]]:
 
 Array = NDArray[np.float64]
 
-MAX_PENDING_STATES = 1024  # number of states that may wait until intervals are searched for events and output times
+MAX_PENDING_STATES = 1024  # if more states than this are pending, the intervals before them are searched for events
 
 
 class OutputRequest(NamedTuple):
@@ -147,8 +147,8 @@ class OutputRequest(NamedTuple):
 class Recorder:
     """Recorder of the states of accepted steps, which it receives in chunks (steps of one call of compiled code).
 
-    The polynomial of a step also interpolates later states. A step is searched for events only when those states are
-    known: so results do not depend on chunk sizes. Event functions are evaluated at least every `max_gap` seconds.
+    The polynomial of a step also passes through states after the step. The step is searched for events only when these
+    are known, so that results do not depend on chunk sizes. Event functions are evaluated at least every `max_gap` s.
     """
 
     def __init__(
@@ -195,7 +195,7 @@ class Recorder:
             self._rows[-1, : len(row)] = row
 
     def store_crossing(self, memory: Array) -> None:
-        """If a crossing step from the last state stored a polynomial in `memory`, copy `memory` for dense output."""
+        """If `memory` has the polynomial of a crossing that began at the last state, copy `memory` for dense output."""
         from twoloop.kernels.steps.crossing_step import END, N_STORED
 
         if self.interpolator is not None and memory[-N_STORED:][END] > -np.inf:
@@ -206,7 +206,7 @@ class Recorder:
         request, store = self.request, self.request.store
         if request.times is None:
             self._store_states(t, rows)
-        elif request.ends_at_outputs:  # steps may also end at times that are not output times
+        elif request.ends_at_outputs:  # steps may also end between output times: leave these states out
             is_output = np.append(request.times, np.inf)[np.searchsorted(request.times, t)] == t
             self._store_states(t[is_output], rows[is_output])
         if request.dense:
@@ -238,7 +238,7 @@ class Recorder:
         return None if self.search is None else self.search.ended
 
     def search_intervals(self, end: int | None = None) -> None:
-        """Search the intervals before pending state `end` (None: the last) for events; store states at output times."""
+        """Search intervals before `end`, index of a pending state (None: the last), for events; store output states."""
         end = len(self._t) - 1 if end is None else end
         interpolator = self.interpolator
         if interpolator is None or self.end_event is not None or self.interrupted:
@@ -307,7 +307,7 @@ class Recorder:
         return DenseSolution(self.interpolator, table, end if self.end_event is None else self.end_event[1])
 
     def events(self) -> tuple[list[Array], list[Array], list[Array]] | tuple[None, None, None]:
-        """Return times, coordinates, velocities: lists of one array per event function, all None without functions."""
+        """Return times, q and v of events: lists of one array per event function; all None if no event is requested."""
         if self.search is None:
             return None, None, None
         n = self._n_q
@@ -534,7 +534,7 @@ INITIAL_COUNTS = np.array([0, 0, 1])
 
 
 def step_fields(steps: Array, counts: Integers) -> dict[str, NDArray[Any]]:
-    """Return the fields with one row per step, such as the step size h, from rows of steps that kernels store.
+    """Return the fields of a record with one row per step, such as h; `steps`: rows of `out_steps` (loop_state.py).
 
     `counts`: the three counts of INITIAL_COUNTS before these steps; on return, after these steps.
     """
@@ -556,7 +556,7 @@ def state_fields(n: int, t: Array, table: Array) -> dict[str, Array]:
 
 
 def interval_kinds(run: "Run", steps: Array) -> Integers:
-    """Return the kinds of `steps` of the run's own method: codes that say which data dense output interpolates."""
+    """Return the kind of interval (a code) of each step, for dense output; no step may be a crossing or a jump."""
     if run.plan.separate:
         return np.full(len(steps), indices.SEPARATE)
     explicit_kind = indices.ACROSS if run.substituted else indices.ACCELERATIONS

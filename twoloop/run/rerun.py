@@ -1,4 +1,4 @@
-"""Check a finished run: compare its callbacks at states of the run, and rerun pieces of the run with another method."""
+"""Check a finished run: compare its callbacks with their traces, and rerun pieces of the run with another method."""
 
 from __future__ import annotations
 
@@ -55,9 +55,10 @@ def check_callbacks_along_run(
     difference. Python forces are called twice, and must return equal values. If `check_derivatives`, derivatives are
     compared with exact ones, or with finite differences. `end`: time at which the run ended.
 
-    `is_due`: if True, compare at all states that `states(True)` returns (rows [t, q, v], latest first). If False,
-    compare only at those of `states(False)` outside the region of earlier comparisons, see `CheckedRegion`.
-    `is_inside`: whether the whole run is in this region.
+    `is_due`: if True, states to compare are chosen from `states(True)`: rows [t, q, v]; the last is the run's start.
+    If False, this is also done if varied parameters are outside the region of earlier comparisons, see `CheckedRegion`.
+    Otherwise, states are chosen from those rows of `states(False)` that are outside this region; no states are compared
+    if `is_inside` (the whole run is inside the region), or if `end` <= run.compared_until[0].
     """
     if changed := describe_changed_force(run):
         return Status.WRONG_TRACE, f"{changed} {message}"
@@ -136,7 +137,7 @@ def python_functions(system: ConstrainedSystem) -> PythonFunctions | None:
 def first_force(system: ConstrainedSystem, t0: float, q0: Array, v0: Array) -> tuple[Any, Array] | None:
     """Return ((t0, q0, v0), value of the compiled force) for `describe_changed_force`; None if the force fails.
 
-    If callbacks are called in Python, return None: the run records calls of the force. Delete records of earlier runs.
+    If callbacks are called in Python, the run will record calls of the force: discard older records, and return None.
     """
     if functions := python_functions(system):
         functions.restart()
@@ -230,7 +231,7 @@ class IndependentRerun:
         self.next_step = np.inf
 
     def integrate(self, t0: float, state: Array, times: Array, max_attempts: int) -> RerunPiece | None:
-        """Integrate from a state [q, v] at t0 to all `times`; None: failed, or more than about `max_attempts` steps."""
+        """Integrate from [q, v] at t0 to all `times`; return None on failure, or after about `max_attempts` steps."""
         run, a, n = self.run, self.run.a, len(state)
         proposed_step, self.next_step = self.next_step, np.inf
         if run.restart(t0, state[: n // 2], state[n // 2 :]) != indices.DONE:

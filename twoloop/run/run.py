@@ -45,8 +45,8 @@ Buffers = tuple[Array, Array, Array]  # arrays of times, states and records of s
 FIRST_CHUNK = 1024
 FIRST_CHUNK_IN_PYTHON = 64  # largest number of steps in the first chunk if callbacks are (slow) Python functions
 SMALL_SYSTEM = 32  # largest number of coordinates of a small system; chunks of larger ones are proportionally smaller
-TRIAL_STEPS = 10  # a method on trial is given up if one of this many first steps is short, see loop_state.TRIAL_STEPS
-NO_PATTERN = np.zeros((0, 0))  # empty argument `pattern` for the fixed-order form, which stores the pattern itself
+TRIAL_STEPS = 10  # number of first steps in which a method on trial must propose step sizes above tolerances[GAP]
+NO_PATTERN = np.zeros((0, 0))  # empty argument `pattern` of `workspace`: a FixedOrderForm has its own pattern
 # constraints contradict one another if a row of G a = Gamma is violated by more than this * max(sum of |terms|, 1)
 CONTRADICTION = 1e-6
 
@@ -121,15 +121,15 @@ class Run:
         self.sizes_to_try: list[float] = []  # step sizes (s) still to be tried across a singular position
         self.attempts_left = np.inf  # the search for a step across a singular position ends after so many failures
         self.crossing_size = 0.0  # size (s) of the last attempted step across a singular position
-        self.piece_ends: list[float] = []  # end times (s) of next steps along a polynomial across a singular position
-        self.origins: list[Any] = []  # `Origin` (begin, limits) of each polynomial still to be tried for a crossing
+        self.piece_ends: list[float] = []  # end times (s) of steps still to be taken along a crossing's polynomial
+        self.origins: list[Any] = []  # the `Origin` of each polynomial that is still to be tried for a crossing
         self.t1 = np.inf  # end of the run (s)
-        self.starts_singular = False  # whether the start is a singular position: C_q has a higher rank beside it
+        self.starts_singular = False  # whether the start is a singular position: nearby, C_q has a higher rank
         self.branch_known = False  # whether it is known on which branch the motion leaves a singular start
         self.jumps: list[float] = []  # times (s) at which velocities jumped because C_t, or b in A v + b = 0, jumped
-        self.compared_until = [-np.inf]  # latest time (s) of a comparison with traces; copies of the run share the list
+        self.compared_until = [-np.inf]  # callbacks and traces agree up to this time (s); a run's copies share the list
         self.region: CheckedRegion | None = None  # where callbacks agreed with traces; None: the system's region
-        self.varied_parameters: Array | None = None  # parameter values now, if systems share this run; None: one system
+        self.varied_parameters: Array | None = None  # current parameters in a ParametricRun; None in other runs
         self._compute_start_accelerations()
         self.rank = len(self.work.rows_v)
         self.descriptions: dict[tuple[int, ...], str] = {}  # cached warnings; the keys are indices of redundant rows
@@ -143,7 +143,7 @@ class Run:
         return new_run
 
     def copy_to_start(self, t0: float, q0: Array, v0: Array) -> "Run | None":
-        """Return a copy of this run at another start; None if ranks differ from this run's, or accelerations fail.
+        """Return a copy of this run at another start; None if constraints have other ranks there, or `restart` fails.
 
         The run must not use the fixed-order form (sparse factors in a fixed order of elimination).
         """
@@ -157,7 +157,7 @@ class Run:
         return new_run
 
     def restart(self, t: float, q: Array, v: Array) -> int:
-        """Begin anew at the state (q, v) at t, without the past steps; return DONE, or why accelerations failed."""
+        """Begin anew at the state (q, v) at t, without the past steps; return DONE or a failure code."""
         n, state = self.system.n_q, self.state
         state[:n], state[n : 2 * n], state[2 * n :] = q, v, 0.0
         self.plan.memory[:] = self.memory
@@ -192,7 +192,7 @@ class Run:
     ) -> int:
         """Take compiled steps to the last of `outputs`, or until Python must act; return the end code (loop_state.py).
 
-        Steps end at all times in `outputs`. States and steps are stored in `buffers`, and their numbers in `filled`.
+        A step ends at each time in `outputs`. States and steps are stored in `buffers`; `filled` counts them.
         `active`: plan, `control` and kit for this call; None: those of the run.
         """
         plan, control, kit = active or (self.plan, self.control, self.kit)
@@ -287,7 +287,7 @@ class Run:
         if code == indices.RANK_DIFFERS:  # keep the rank at the start of the run, even if the rank is higher now
             self.work.notes[indices.GENERATION] = 1.0
             code = entry_point(self.kernels.start)(self.kit, self.work, t, state)
-        if old_work.notes[indices.PIVOT] > 0.0 and largest_pivot > 0.0:  # pivots of the new form have another scale
+        if old_work.notes[indices.PIVOT] > 0.0 and largest_pivot > 0.0:  # rescale the largest pivot for the new form
             pivot = self.work.notes[indices.PIVOT]
             self.clock[self.a.LARGEST_PIVOT] = pivot * max(1.0, largest_pivot / old_work.notes[indices.PIVOT])
 
@@ -300,7 +300,7 @@ class Run:
             self.work = self._make_workspace(rank, rank)
             code = start(self.kit, self.work, self.t0, self.state)
         if self.fixed_order is not None and code not in (indices.DONE, indices.NOT_FINITE):
-            if self.work.notes[indices.SMALLEST] < 0.0:  # M is not definite: no fixed-order form in later runs
+            if self.work.notes[indices.SMALLEST] < 0.0:  # M is not definite: later runs must not use this form
                 self.system.derived["fixed-order form"] = None
             self.fixed_order = None
             self.kit = make_kit(self.system, self.t0, self.state[: self.system.n_q], self.plan)
@@ -336,7 +336,7 @@ class Run:
         )
 
     def find_redundant_rows(self) -> tuple[NDArray[np.int64], str]:
-        """Return indices of redundant rows at the start and a warning; raise ValueError for contradictory rows."""
+        """Return indices of redundant rows at the start, and a warning or ""; ValueError if rows are contradictory."""
         n_rows = self.system.n_c + self.system.n_a
         if self.rank == n_rows:
             return np.zeros(0, dtype=np.int64), ""
@@ -369,7 +369,7 @@ class Run:
         return describe_singular_start(self.system, self.t0, q, self.rank, self.rtol, atol)
 
     def violated_rows(self, rows: Rows) -> NDArray[np.int64]:
-        """Return the indices of the constraint rows that the accelerations at the start violate; `rows`: G."""
+        """Return the indices of the rows of G a = Gamma that the accelerations at the start violate; `rows`: G."""
         n = self.system.n_q
         a, gamma = self.state[2 * n : 3 * n], self.work.Gamma
         residual = np.abs(rows @ a - gamma)
@@ -385,7 +385,7 @@ class Run:
         if self.fixed_order is None or set(rows) & set(independent_rows):
             return describe_dependence(self.system.rows(self.t0, q), rows)
         factors, zero, x = np.zeros((min(SHOWN, len(rows)), len(all_rows))), np.zeros(len(all_rows)), np.zeros_like(q)
-        for row, factor in zip(rows, factors, strict=False):  # find coefficients: row = factor @ independent rows
+        for row, factor in zip(rows, factors, strict=False):  # write this row as factor @ (independent rows)
             entry_point(self.kit.inner)(self.kit, self.work, SOLVE, self.t0, all_rows.row(row), zero, 0.0, x, factor)
         return describe_equations(rows, independent_rows, factors[:, independent_rows], norms(all_rows))
 
@@ -399,23 +399,23 @@ class Run:
         self.control[self.a.SHORTEST] = cached_run().SHORTEST_STEP * first_size
 
     def limit_steps(self) -> None:
-        """Limit step sizes so that forces are evaluated at least every hundredth of the run, to detect short forces.
+        """Limit steps so that successive force evaluations are at most 1 % of the run apart, to detect short forces.
 
-        If forces may be steep, steps are at most a hundredth of the run, unless the method evaluates forces within its
-        steps: one evaluation alone may not detect a short force.
+        If forces may vary much within a step, one evaluation at a stage may not detect a short force: then the step
+        size itself is at most 1 % of the run. Methods that add evaluations within long steps need no limit.
         """
         gap = 1.0 if self.forces_may_be_steep else self.plan.max_gap
         max_size = np.inf if self.plan.evaluates_within else self.tolerances[indices.GAP] / gap
         self.control[self.a.MAX_STEP], self.control[self.a.MAX_EVALUATION_GAP] = min(self.max_step, max_size), gap
 
     def choose_first_step(self, t: float, t1: float, state: Array, longest: float = 0.0) -> float:
-        """Return the size (s) of the first step from a state; if `longest` > 0 (max_step), store limits of sizes."""
+        """Return the size (s) of the first step from a state; if `longest` (max_step) > 0, also store step limits."""
         numbers = self.system.n_q, t, t1, self.least_atol, longest, self.plan.evaluates_within
         size: float = entry_point(cached_run().first_step_and_limits)(self.control, self.tolerances, state, *numbers)
         return size
 
     def defect(self) -> float | None:
-        """Return the largest defect of the steps, or None if the defect was not evaluated in all steps."""
+        """Return the largest defect of the steps, or None if there is a step whose defect was not evaluated."""
         notes = self.work.notes
         is_checked = self.work.counters[indices.N_ACCEPTED] > 0 and notes[indices.UNCHECKED] == 0.0
         return float(notes[indices.LARGEST_DEFECT]) if is_checked else None
@@ -425,7 +425,7 @@ class Run:
 
         This is checked at output times, and at the ends of steps of fixed size.
         """
-        # pivots of the fixed-order form vary more: there, only a ratio below SMALL_PIVOT shows a singular position
+        # pivots of the fixed-order form differ more than those of other forms: min / max pivot has a smaller limit
         threshold = self.near_threshold if self.fixed_order is None else SMALL_PIVOT
         return bool(self.clock[self.a.PIVOT_AT_OUTPUT] < threshold)
 

@@ -33,9 +33,9 @@ from twoloop.run.singular_start import branch_at
 
 Array = NDArray[np.float64]
 
-MAX_ATTEMPTS = 1024  # after this many attempted integration steps in one sample, `IntegrationLoop` takes over
+MAX_ATTEMPTS = 1024  # after this many attempted steps from one sampling time to the next, `IntegrationLoop` takes over
 FORCE_KINDS = {"force", "force_by_q", "force_by_v"}  # parameters that change may enter these callbacks only
-CHANGED_PARAMETERS = "the parameters changed at samples"  # `changes` in each Result of a SampledRun
+CHANGED_PARAMETERS = "the parameters changed at samples"  # value of `Result.changes` of a SampledRun
 
 
 class SampledState(NamedTuple):
@@ -121,7 +121,7 @@ class SampledRun:
                 f"have lost rank there ({dependent_rows(self._derived_system, t, q)}), but not beside it. Start a "
                 "little before that position, or beyond; run and solve_dae may start there"
             )
-        run.work.notes[indices.GENERATION] = 1.0  # as if a partition had been chosen: ranks are known
+        run.work.notes[indices.GENERATION] = 1.0  # as if a partition existed: kernels then keep the ranks of C_q and G
         run.set_step_sizes(None, self.max_step, t + 1.0)
         run.control[run.a.STORE_ALL] = 0.0
         return run
@@ -168,12 +168,12 @@ class SampledRun:
         return self.state
 
     def _step_to(self, end: float) -> None:
-        """Integrate to the time `end`; if short changes may have been missed, integrate again with denser samples."""
+        """Integrate to `end`; if short changes of forces may have been missed, integrate again with more samples."""
         for _ in range(MAX_REPETITIONS):
             self._integrate_to(end)
             if not may_have_missed_changes(self.run):
                 return
-            if len(self.times) > 1:  # earlier calls, which are not repeated, may have missed short changes, too
+            if len(self.times) > 1:  # earlier calls of `step` may also have missed short changes, but are not repeated
                 warn_of_missed_changes(self.run)
             self._max_gap = gap_for_repetition(self.run)
             self._return_to_sample()
@@ -231,7 +231,7 @@ class SampledRun:
         run, a = self.run, self.run.a
         code = entry_point(run.kernels.start)(run.kit, run.work, t, run.state)
         n_not_reset = 0
-        if run.plan.first is not None:  # keep the numbers by which a pair of methods switches
+        if run.plan.first is not None:  # a pair of methods keeps the estimates and counts that decide when it switches
             from twoloop.kernels.control.stiffness import N_SCALARS
 
             n_not_reset = N_SCALARS + 2 * run.system.n_q
@@ -279,7 +279,7 @@ class SampledRun:
         self._parameters_changed = True
 
     def _check_enters_forces_only(self, index: int, value: float) -> None:
-        """Raise ValueError if a new `value` of a parameter changes other callbacks than forces: states would jump."""
+        """Raise ValueError if a new `value` of parameter `index` changes more than forces: states would jump."""
         old_value, n = float(self.p[index]), self.system.n_q
         t, row = self.times[-1], self.rows[-1]
         state = {"q": row[:n], "v": row[n : 2 * n]}

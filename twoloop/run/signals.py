@@ -14,7 +14,7 @@ from twoloop.problem.system import ConstrainedSystem
 
 # code objects of the two functions of twoloop that call the user's callbacks and event functions
 CALLERS_OF_USER_CODE = (PythonFunctions.call.__code__, Event.__call__.__code__)
-COMPILERS = ("numba", "llvmlite")  # packages in which a handler must not raise: data of these would be left incomplete
+COMPILERS = ("numba", "llvmlite")  # packages in which a handler must not raise: their data would be left incomplete
 # signals whose handlers are replaced; not all of them exist on Windows
 SIGNAL_NAMES = ("SIGALRM", "SIGINT", "SIGTERM", "SIGUSR1", "SIGUSR2", "SIGVTALRM", "SIGPROF", "SIGHUP")
 SIGNAL_NUMBERS = [int(getattr(signal, name)) for name in SIGNAL_NAMES if hasattr(signal, name)]
@@ -68,7 +68,7 @@ class SignalHandlers:
             raise self._handler_error from None
 
     def restore(self) -> None:
-        """Restore the handlers that the user has not replaced meanwhile; then call `call_delayed`."""
+        """Restore the user's handlers, unless the user has set new ones meanwhile; then call `call_delayed`."""
         for number, handler in self._user_handlers.items():
             if _signal.getsignal(number) == self._receive:
                 _signal.signal(number, handler)
@@ -79,12 +79,12 @@ class SignalHandlers:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
         if error is not None and error is self._handler_error:
-            self._handler_error = None  # `error` propagates anyway: `restore` must not raise it a second time
+            self._handler_error = None  # `error` leaves the `with` block anyway: `restore` must not raise it again
         self.restore()
 
 
 def signals_of(system: ConstrainedSystem) -> SignalHandlers:
-    """Return a context manager for a block that catches exceptions: those of signal handlers are raised at its end."""
+    """Return a context manager that raises exceptions of signal handlers again, even if its block catches them."""
     return SignalHandlers(ctrl_c=system.called_in_python)
 
 

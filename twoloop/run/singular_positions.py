@@ -37,8 +37,8 @@ JUMP_RATIO, MIN_JUMP = 3.0, 10.0
 def describe_crossings(system: ConstrainedSystem, crossings: Crossings, end_state: TimedState, rank: int) -> str:
     """Return sentences about the singular positions that steps crossed, for the message of a result.
 
-    `crossings`: for each position, the states before and after it; if a run ended within a crossing, its last state
-    `end_state` replaces the missing state after it. `rank`: rank of the constraint Jacobian at other positions.
+    `crossings`: for each singular position, the states before and after it. If the run ended within the crossing, its
+    last state, `end_state`, counts as the state after it. `rank`: rank of the Jacobian far from singular positions.
     """
     ratios = {
         ends[0][0]: _least_ratio_between(system, ends[0], [*ends, end_state][1], rank) for ends in crossings[:MAX_SHOWN]
@@ -139,7 +139,7 @@ def has_velocity_jump_at_end(times: Array, rows: Array, n: int) -> bool:
 
 
 def _crossing_ends(crossings: Crossings, end_state: TimedState) -> Iterator[tuple[TimedState, TimedState, bool]]:
-    """Yield, for each position, the states before and after it, and whether a crossing was completed in between."""
+    """Yield, for each singular position, the states before and after it, and whether the crossing was completed."""
     before: TimedState | None = None
     for first, *after in crossings:
         before = first if before is None else before
@@ -151,7 +151,7 @@ def _crossing_ends(crossings: Crossings, end_state: TimedState) -> Iterator[tupl
 
 
 def _largest_acceleration(system: ConstrainedSystem, t: float, q: Array, v: Array, min_ratio: float) -> float:
-    """Return max|a_j|; singular values of the Jacobian below `min_ratio` times the largest one count as zero."""
+    """Return max|acceleration|; singular values of the Jacobian below `min_ratio` times the largest count as zero."""
     mass, rows, norms, units = scaled_to_unit_masses(system, t, q)
     left, values, right = np.linalg.svd(rows, full_matrices=False)
     is_kept = values > min_ratio * values[0]
@@ -164,7 +164,7 @@ def _largest_acceleration(system: ConstrainedSystem, t: float, q: Array, v: Arra
 
 
 def scaled_to_unit_masses(system: ConstrainedSystem, t: float, q: Array) -> tuple[Array, Array, Array, Array]:
-    """Return M and the constraint Jacobian, both scaled, the divisors of rows, and the units of coordinates.
+    """Return the scaled M, the scaled constraint Jacobian, the divisors of its rows, and the units of coordinates.
 
     q_j is scaled as q_j / unit_j with unit_j = 1 / sqrt(M_jj), so that the diagonal entries of M become 1. After
     division by the divisors, rows of the Jacobian have the norm 1, unless they are small only at this position.
@@ -194,22 +194,25 @@ def _describe_ratio(ratios: dict[float, float]) -> str:
 
 
 ROUNDING = 0.5 * float(np.finfo(np.float64).eps)
-# rounding errors of velocities are estimated only if smallest / largest singular value of the Jacobian is at most this
+# rounding errors matter only along directions in which the Jacobian's singular value is at most this * the largest one
 WEAK_RATIO = 1e-2
-# rounding errors of velocities are always estimated if (smallest / largest pivot) of the Jacobian is below SMALL_PIVOT.
+# whatever rtol is, rounding errors of velocities are estimated if min / max pivot of the Jacobian is below SMALL_PIVOT.
 # This ratio of pivots is typically PIVOT_FACTOR times (smallest / largest singular value)
 SMALL_PIVOT, PIVOT_FACTOR = 1e-5, 30.0
 
 
 def singular_threshold(rtol: float) -> float:
-    """Return the ratio (smallest / largest pivot) below which rounding may change v by REPORTED_ERROR times rtol."""
+    """Return the limit of (min / max pivot of C_q) below which rounding changes v by more than REPORTED_ERROR * rtol.
+
+    The limit is at least SMALL_PIVOT and at most WEAK_RATIO.
+    """
     return min(
         WEAK_RATIO, max(SMALL_PIVOT, PIVOT_FACTOR * float(np.sqrt(ROUNDING / (REPORTED_ERROR * max(rtol, ROUNDING)))))
     )
 
 
 def velocity_rounding_errors(system: ConstrainedSystem, t: float, q: Array, v: Array, rank: int) -> Array:
-    """Estimate the errors (n_q,) of velocities due to rounding of positions; return NaN if callbacks fail near q."""
+    """Estimate errors (n_q,) of v due to rounding of q: infinite if rank is lost at q, NaN if callbacks fail near q."""
     rows = system.rows(t, q)
     left, values, right = np.linalg.svd(rows, full_matrices=False)
     errors = np.zeros(len(q))
@@ -225,7 +228,7 @@ def velocity_rounding_errors(system: ConstrainedSystem, t: float, q: Array, v: A
             row_slopes = np.abs(np.subtract(*(system.rows(t, each) for each in displaced)))
         except (ArithmeticError, ValueError):  # a square root, for example, fails beyond a dead centre
             return np.full(len(q), np.nan)
-        # rounding errors of constraints are those of q times Jacobian entries nearby, because entries at q may be small
+        # entries of the Jacobian at q may be small: estimate errors of C, due to rounding of q, with entries near q
         nearby_rows = np.abs(rows) + (row_slopes * (np.abs(rows).max() / row_slopes.max()) if row_slopes.any() else 0.0)
         rounding = ROUNDING * np.sqrt((nearby_rows * nearby_rows) @ (q * q))
         errors = np.maximum(

@@ -25,18 +25,18 @@ MAX_VIOLATION = 1e-3  # velocities v are rounding errors of rest if max|C_q v| i
 CHANGE_PER_SAMPLE = 3e-3  # finite differences in time use samples between which C_q changes by about this fraction
 # weights of five equidistant samples in finite differences; row 0: first derivative, row 1: second derivative
 WEIGHTS = np.array([[1.0, -8.0, 0.0, 8.0, -1.0], [-1.0, 16.0, -30.0, 16.0, -1.0]]) / 12.0
-# assumed relative error of finite differences: if a displacement of max|q| changes C_q less, dC_q/dt counts as zero
+# assumed relative error of differences. dC_q/dt counts as 0 if moving by max|q| changes C_q by less than this fraction
 MAX_DIFFERENCE_ERROR = 1e-8
 # the rank of C_q rises along the motion if (ds/dt) / |dC_q/dt| exceeds this; s: a singular value, zero at the start
 MIN_RANK_DERIVATIVE = 1e-6
 # let s be a singular value of C_q that is zero at the start: ds/dt is certainly not zero if it exceeds this multiple of
-# its uncertainty, which is the norm of dC_q/dt for a velocity as large as the tolerances
+# the norm that dC_q/dt would have if the velocities were as large as the tolerances
 MIN_CLARITY = 10.0
 # a run begins beside its singular start, at a state where C_q has changed by the fraction BESIDE_CHANGE or less. Its
 # first step changes C_q by about the fraction STEP_CHANGE
 BESIDE_CHANGE, STEP_CHANGE = 0.1, 0.6
-# up to N_BESIDE states near the singular start are tried, each half as far away as the last. A state is accepted if its
-# projection onto the constraints moves it by at most MAX_CORRECTION times the state's distance from the start
+# up to N_BESIDE states near the start are tried, each at half the distance of the previous one. A state is accepted if
+# its projection onto the constraints moves it by at most MAX_CORRECTION times the state's distance from the start
 N_BESIDE, MAX_CORRECTION = 6, 0.2
 MAX_RESIDUAL = 1e-6  # largest residual allowed in the equations for the accelerations, relative to the right-hand side
 
@@ -56,12 +56,12 @@ class Branch(NamedTuple):
 
 
 def branch_at(system: ConstrainedSystem, t: float, state: Array, rank: int, allowed: Array) -> Branch | bool | None:
-    """Find out whether a start is in a singular position; if so, return the Branch of the motion that leaves it.
+    """Return the Branch that leaves a singular start; None: the start is not singular; False: no branch is certain.
 
-    `state`: [q, v, a] at the start; `rank`: rank of C_q at the start. Return None if the start counts as not singular:
-    the rank does not rise along the motion, or C depends on t, or non-holonomic constraints exist. Return False if the
-    branch is not certain: velocities of another branch may be closer to v than the tolerances `allowed` (n_q,), or no
-    state on the branch was found.
+    `state`: [q, v, a] at the start; `rank`: rank of C_q at the start. The start counts as not singular if the rank does
+    not rise along the motion, if C depends on t, or if non-holonomic constraints exist. The branch is not certain if
+    velocities of another branch may be closer to v than the tolerances `allowed` (n_q,), if the residual of a exceeds
+    MAX_RESIDUAL, or if no state on the branch was found.
     """
     if system.n_a > 0 or "constraint_rate" in system.given or not 0 < rank < min(system.n_c, system.n_q):
         return None
@@ -120,7 +120,7 @@ def _branch_at(system: ConstrainedSystem, t: float, state: Array, rank: int, all
     force = null_space.T @ (units * system.force(t, q, v) - mass @ a)
     a += null_space @ np.linalg.solve(null_space.T @ mass @ null_space, force)
     a *= units
-    acceleration = 0.0  # part of d^2 C_q/dt^2 due to a, divided by the norm of C_q, 1/s^2
+    acceleration = 0.0  # |part of d^2 C_q/dt^2 due to a| / |C_q|, in 1/s^2
     if a.any():
         acceleration = float(np.linalg.norm(derivative_of_rows(a, distance / float(np.abs(a).max())))) / norm
     for change in BESIDE_CHANGE * 0.5 ** np.arange(N_BESIDE):
@@ -136,5 +136,5 @@ def _branch_at(system: ConstrainedSystem, t: float, state: Array, rank: int, all
 
 
 def _time_of_change(change: float, speed: float, acceleration: float) -> float:
-    """Return the time (s) in which C_q changes by the fraction `change`, given (its two time derivatives) / |C_q|."""
+    """Return the time (s) in which C_q changes by `change` with `speed` and `acceleration`, all relative to |C_q|."""
     return 2.0 * change / (speed + float(np.sqrt(speed * speed + 2.0 * acceleration * change)))

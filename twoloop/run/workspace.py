@@ -56,7 +56,7 @@ def newton_form(
     bodies: list[tuple[int, ...]],
     stiff: list[int],
 ) -> tuple[NDArray[np.int32], int] | None:
-    """Return the program (list of operations) that factorizes Newton's sparse matrix, and the number of column groups.
+    """Return the program to factorize Newton's sparse matrix, and the number of groups of columns computed together.
 
     Columns of a group have no nonzero entries in the same row: so one finite difference of forces yields all of them.
     `mass`, `jacobian`: indices of nonzero entries of M and C_q. `bodies`: coordinates of each body. `stiff`: result of
@@ -70,7 +70,7 @@ def newton_form(
         q = q0 + scale * magnitude * rng.uniform(-1.0, 1.0, system.n_q)
         try:
             entries |= _derivative_entries(system, t0, q, rng.uniform(-1.0, 1.0, system.n_q), lam, max_entries)
-        except Exception:  # callbacks fail at q: skip this position; a run later finds the missing entries
+        except Exception:  # skip a position where callbacks fail; a run later finds entries that are missed here
             continue
         if len(entries) > max_entries:
             return None
@@ -139,7 +139,7 @@ class FixedOrderForm(NamedTuple):
         return self.n_groups + float(self.newton_program[N_UPDATES]) / max(1.0, float(self.program[N_UPDATES]))
 
     def newton_matrices_size(self, matrices: int) -> int:
-        """Return the length of the array of sparse matrices that replaces a plan's `matrices` dense ones (n_q, n_q)."""
+        """Return the length of the array that contains a plan's sparse matrices instead of `matrices` dense ones."""
         from twoloop.kernels.steps.newton_systems import matrices_size
         from twoloop.kernels.steps.stages import SYSTEMS
 
@@ -202,9 +202,9 @@ def _create_fixed_order_form(system: ConstrainedSystem, t0: float, q0: Array) ->
 
 
 def _coordinates_of_bodies(system: ConstrainedSystem, mass: Entries) -> list[tuple[int, ...]]:
-    """Return for each known body the tuple of its coordinates (indices).
+    """Return the indices of each body's coordinates; a body may be missing if no Joint names its coordinates.
 
-    The joints of the system name one body each, so that bodies at the ends of chains may be missing. If all bodies have
+    A Joint names the coordinates of one body only, so that the last body of a chain may be missing. If all bodies have
     seven coordinates (position and Euler parameters), no body is missing.
     """
     coordinates_by_joint = [joint.translation + joint.rotation for joint in system.joints]
@@ -221,8 +221,8 @@ def _stiff_rows(
 ) -> list[int]:
     """Choose the rows g of C_q for which g^T g is added to a singular M to make it invertible; return their indices.
 
-    See sparse_ldl.py. A row must belong to one body (as for the norm of Euler parameters), so that g^T g has no entries
-    where M has none. Rows are chosen only until M is invertible.
+    See sparse_ldl.py. Each row contains coordinates of one body only, such as the row for the norm of Euler parameters,
+    so that g^T g has no entries where M has none. Rows are chosen only until M is invertible.
     """
     values = system.mass_values(t0, q0) if "mass" in system.entries else system.mass(t0, q0)[mass]
     body_of = np.array(bodies_of(system.n_q, mass, bodies))
@@ -257,7 +257,7 @@ def _stiff_rows(
 
 
 def _massless_directions(block: Array) -> Array:
-    """Return the massless directions of a body, as rows, given its `block` of M; if this is not finite, return all."""
+    """Return a body's massless directions, as rows, given its `block` of M; all directions if `block` is not finite."""
     if not np.isfinite(block).all():
         return np.eye(len(block))
     values, directions = np.linalg.eigh(block)
@@ -282,7 +282,7 @@ def _mass_pattern(system: ConstrainedSystem, t0: float, q0: Array) -> Array:
     for scale, direction in zip(NEARBY[:1] if system.constant_mass else NEARBY, directions, strict=False):
         try:
             mass = system.mass(t0, q0 + scale * magnitudes * direction)
-        except Exception:  # callbacks fail: skip this position; a run later finds the missing entries
+        except Exception:  # skip a position where callbacks fail; a run later finds entries that are missed here
             continue
         pattern[(mass != 0.0) | (mass.T != 0.0)] = 1.0
     return pattern
@@ -380,7 +380,7 @@ def kit_for_plan(system: ConstrainedSystem, flags: Array, plan: Plan | None) -> 
 
 
 def _steps_of_plan(plan: Plan) -> tuple[Any, Any, Any]:
-    """Return a plan's Step and both Steps of its pair; None without a pair, PLACEHOLDER_STEP if not imported yet."""
+    """Return a plan's Step and the Steps of its pair (None: no pair; PLACEHOLDER_STEP: second not imported yet)."""
     return load_step(plan.step), load_step(plan.first), step_if_loaded(plan.second)
 
 

@@ -158,7 +158,7 @@ _warnings: list[str] = []  # the warning that `_warn_first` has printed; empty i
 
 
 def _warn_first(text: str) -> None:
-    """Print a warning about files of other users on stderr, but only the first one in this process."""
+    """Warn on stderr about code that other users can write; only the first call in a process prints its text."""
     if not _warnings:
         _warnings.append(text)
         print(text, file=sys.stderr, flush=True)
@@ -169,7 +169,7 @@ CHECKSUM_SIZE = hashlib.sha256().digest_size  # length (bytes) of the checksum a
 
 
 class CodeFiles:
-    """Store the machine code of a function on disk, in one file with a checksum for each key, such as a signature.
+    """Store the machine code of a function on disk: for each key, such as a signature, one file with a checksum.
 
     Only the user can write these files. A file counts as missing if it is damaged or out of date: written with another
     `stamp` or version of numba. There is no index file like numba's, which several processes may damage.
@@ -203,7 +203,7 @@ class CodeFiles:
         return pickle.loads(data) if origin == repr((*self.origin, key)) else None
 
     def flush(self) -> None:
-        """Remove the files of all keys."""
+        """Remove all files of the function, for all keys (such as signatures)."""
         for path in self._paths_of_files():
             path.unlink(missing_ok=True)
 
@@ -308,8 +308,8 @@ def cache_folder(package: types.ModuleType) -> Path | None:
 def give_unique_name(function: Callable[..., Any], digests: tuple[str, str] | None) -> Callable[..., Any]:
     """Return a copy of a nested function or lambda, with a unique name; return any other function itself.
 
-    Numba names code by the function's qualified name and a counter: closures compiled by two processes may get the same
-    name, and a process that loads both would run one code for both. If `digests` is None (no files), nothing is copied.
+    Numba names code by the qualified name and a counter: closures compiled by two processes may get the same name, and
+    a process that loads both would run one code for both. If `digests` is None, no code is stored, and no copy is made.
     """
     if digests is None or "<" not in function.__qualname__:
         return function
@@ -328,7 +328,7 @@ class _CodeCache(FunctionCache):
 
     def __init__(self, function: Callable[..., Any], stamp: str, key: str, announcement: str):
         cache_dir: str = numba.config.CACHE_DIR  # type: ignore[attr-defined]
-        if cache_dir:  # create the folder before numba does, which might let other users write to it
+        if cache_dir:  # create the folder first: numba might create a folder that other users can write
             with suppress(OSError):
                 make_trusted_folder(Path(cache_dir, _LOCATOR.get_suitable_cache_subpath(inspect.getfile(function))))
         super().__init__(function)
@@ -393,12 +393,12 @@ def compiled_when_called(**options: Any) -> Callable[[Callable[..., Any]], Dispa
 
 
 def digests_of(function: Callable[..., Any]) -> tuple[str, str] | None:
-    """Return two digests of all values on which the machine code of a function depends; set up its helpers' caches.
+    """Return two digests of all that a function's machine code depends on; replace numba's cache of functions it calls.
 
-    Helpers are the compiled functions that the function calls; twoloop's cache replaces numba's cache of them. The
-    first digest covers code, defaults and globals of the function, and attributes of modules that it uses; the second
-    one its closure variables; both also cover the values that helpers use. Return None if a value could change without
-    a change of the digests.
+    The first digest covers code, defaults and globals of the function, and attributes of modules that it uses. The
+    second digest covers its closure variables. Both also cover the values used by helpers, the compiled functions that
+    the function calls. Twoloop's cache replaces numba's cache of the helpers. Return None if a value could change
+    without a change of the digests.
     """
     digests, helpers = _digests_and_helpers(function)
     for each in helpers:
@@ -407,9 +407,9 @@ def digests_of(function: Callable[..., Any]) -> tuple[str, str] | None:
 
 
 def _digests_and_helpers(function: Callable[..., Any]) -> tuple[tuple[str, str] | None, list[Any]]:
-    """Return the result of `digests_of`, and the helpers of a function; each comes after the helpers that it calls."""
+    """Return the result of `digests_of` for a function, and its helpers, each one after the helpers that it calls."""
     code, closure = Digest(), Digest()
-    closure.names = reachable_names(function)  # if a value is a module, its attributes with these names are hashed
+    closure.names = reachable_names(function)  # if a closure variable is a module, hash its attributes with these names
     try:
         code.add_function(function, enclosed=False)
         closure.add(closure_values(function))

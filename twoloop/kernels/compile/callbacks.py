@@ -148,7 +148,7 @@ class CallbackKind:
 
     @property
     def optional(self) -> bool:
-        """Return True if a system may lack this callback, unless `needed_by` requires it."""
+        """Return True if systems may lack this callback, apart from those that need it according to `needed_by`."""
         return self.absent != ""
 
     @cached_property
@@ -470,7 +470,7 @@ def _remove_colours(error: Exception) -> str:
 def _informative_line(error: Exception) -> str:
     """Return the type of an error, and that line of numba's message which states the reason."""
     message = _remove_colours(error)
-    message = re.sub(r":\s*>>> ", ": ", _SOURCE_EXCERPT.sub("", message))  # remove the sign before a rejected signature
+    message = re.sub(r":\s*>>> ", ": ", _SOURCE_EXCERPT.sub("", message))  # remove >>> before a rejected signature
     lines = [line.strip() for line in message.splitlines() if line and not line.startswith("    ")]
     useful = [line for line in lines if line and not _UNINFORMATIVE_LINE.match(line) and not line.startswith("def ")]
     return f"{type(error).__name__}: {useful[-1] if useful else message.strip()[:200]}"

@@ -277,7 +277,7 @@ def _value_and_items(location: FrozenValue, seen: set[int]) -> Iterator[FrozenVa
     seen.add(id(location.value))
     fields = getattr(location.value, "_fields", None)
     for k, value in enumerate(location.value):
-        if isinstance(value, (tuple, np.ndarray, np.void)) or callable(value):  # items of other types cannot change
+        if isinstance(value, (tuple, np.ndarray, np.void)) or callable(value):  # skip numbers etc., which cannot change
             name = f"{location.name}[{k}]" if fields is None else f"{location.name}.{fields[k]}"
             yield from _value_and_items(FrozenValue(None, "", name, value), seen)
 
@@ -345,7 +345,7 @@ class FunctionCopier:
         self.copies: dict[Any, Any] = {}  # replacements, by id of the original
 
     def replacement_of(self, value: Any, names: frozenset[str] = frozenset()) -> Any:
-        """Return `value` after replacing helpers: itself, items of a tuple, or the attributes `names` of a module."""
+        """Replace a compiled helper, or helpers in a tuple or in a module's attributes `names`; return the result."""
         if self.is_copied(value):
             if id(value) not in self.copies:
                 self._add_copy(value)
@@ -357,7 +357,7 @@ class FunctionCopier:
         return value
 
     def is_copied(self, value: Any) -> bool:
-        """Return True for compiled helpers, which `replacement_of` then copies; derived classes may add values."""
+        """Return whether `replacement_of` copies a value: a compiled helper or, in a derived class, any function."""
         return isinstance(value, Dispatcher) or bool(jitable_templates(value))
 
     def _copy_module(self, module: types.ModuleType, names: frozenset[str]) -> types.ModuleType:

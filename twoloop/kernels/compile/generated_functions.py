@@ -51,7 +51,7 @@ class DeferredFunctions:
         return self.functions.addresses
 
 
-_FUNCTIONS_IN_MEMORY: dict[str, BoundedCache] = defaultdict(BoundedCache)  # GeneratedFunctions by kind, then by key
+_FUNCTIONS_IN_MEMORY: dict[str, BoundedCache] = defaultdict(BoundedCache)  # {kind: {key: GeneratedFunctions}}
 
 
 def generated_functions(
@@ -70,7 +70,7 @@ def generated_functions(
     files, disk_key = _code_files(kind, stamp), _disk_key(key)
     try:
         names_and_content = files.load(disk_key)
-    except Exception:  # another installation wrote an incompatible file: compile, and replace the file below
+    except Exception:  # if another installation wrote an incompatible file, compile again and overwrite the file
         names_and_content = None
     if names_and_content is None:
         names, text = write()

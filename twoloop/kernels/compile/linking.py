@@ -55,7 +55,7 @@ def jitable_templates(function: Any) -> list[Any]:
         return []
     closures = [getattr(getattr(each, "_overload_func", None), "__closure__", None) for each in templates]
     is_own = [any(cell.cell_contents is function for cell in source or ()) for source in closures]
-    return templates if all(is_own) else []  # []: numba compiles calls of this function from an overload
+    return templates if all(is_own) else []  # []: an `overload` replaces `function` in compiled code
 
 
 def add_signature(function: Dispatcher, signature: Any) -> None:
@@ -209,7 +209,7 @@ _RULES: list[tuple[Any, str, Callable[..., Any]]] = [
     (event, "start_event", _skip_lock_events(event.start_event)),
     (event, "end_event", _skip_lock_events(event.end_event)),
 ]
-_MISSING_ATTRIBUTE = object()  # stands for the original of an inherited attribute: its replacement will be deleted
+_MISSING_ATTRIBUTE = object()  # original value of an inherited attribute, whose replacement will simply be deleted
 _depth = [0]  # number of active contexts `kernel_rules`; only the outermost one replaces and restores functions
 
 
@@ -243,21 +243,21 @@ class _CodegenWithoutEnvironment:
         return getattr(self._codegen, name)
 
     def set_env(self, name: str, environment: Any) -> None:
-        """Do nothing: a helper has no environment."""
+        """Do nothing: only functions that Python calls need this environment (their Python data)."""
 
 
 class _HelperLibrary(CPUCodeLibrary):
-    """LLVM's intermediate code of a helper; it becomes part of the machine code of callers."""
+    """LLVM's intermediate code of a helper (called by compiled functions only), to be linked into its callers."""
 
     @property
     def codegen(self) -> Any:
         return _CodegenWithoutEnvironment(self._codegen)
 
     def get_pointer_to_function(self, name: str) -> int:
-        return 0  # Python never calls a helper
+        return 0  # no address, because Python never calls a helper
 
     def _optimize_final_module(self) -> None:
-        pass  # the code is optimised as part of the callers
+        pass  # the code of a helper is optimised as part of its callers
 
     def _get_module_for_linking(self) -> Any:
         """Return the module to link into callers; numba would return a copy, but nothing else uses this module."""
@@ -342,7 +342,7 @@ def entry_point(function: Dispatcher) -> Any:
     return compiled.entry_point
 
 
-# address of machine code, by compiled function: one address, because each function is compiled for one signature
+# addresses of machine code; a compiled function has only one, because it is compiled for one signature only
 _ADDRESSES: WeakKeyDictionary[Dispatcher, int] = WeakKeyDictionary()
 
 

@@ -39,7 +39,7 @@ class Reference(types.Type):
 
     name : unique name of the type.
     arrays : type of each array, by name of its field; all arrays are contiguous, with one or two dimensions.
-    elements : by field of an array: {name: index}. In compiled code, `structure.name` is the element at this index.
+    elements : {field of an array: {name: index of an element}}; in compiled code, `structure.name` is this element.
     """
 
     def __init__(
@@ -53,7 +53,7 @@ class Reference(types.Type):
         self.elements = {element: (array, i) for array, named in elements.items() for element, i in named.items()}
         self.functions: dict[str, Signature] = {}
         self.llvm_functions: set[str] = set()  # fields in `functions` whose functions are generated as LLVM code
-        self.offsets: dict[str, int] = {}  # index of each field's address in the table; sizes of an array follow it
+        self.offsets: dict[str, int] = {}  # index of each field's address in the table; an array's sizes follow
         self.n_words = 0  # length of the table so far
         self._addresses: Any = BoundedCache()  # addresses of machine code, by the tuple of all functions of a structure
         for field, kind in self.arrays.items():
@@ -126,7 +126,7 @@ register_model(Reference)(models.OpaqueModel)
 def _unbox(typ: Any, obj: Any, c: Any) -> NativeValue:
     """Emit code that converts an argument, the Python object of a structure, to a pointer to its table.
 
-    The object has an attribute `address`; or it is this address itself, an integer, which saves 0.1 microseconds.
+    The argument has an attribute `address`, or is the address itself: passing an integer saves 0.1 microseconds.
     """
     python_type = c.builder.load(
         c.builder.gep(c.builder.bitcast(obj, obj.type.as_pointer()), [ir.Constant(ir.IntType(32), 1)])
@@ -212,7 +212,7 @@ def _load_array(context: Any, builder: Any, typ: Any, pointer: Any, field: str) 
     }
     model = context.data_model_manager[kind]
     array = ir.Constant(context.get_value_type(kind), ir.Undefined)
-    for name, value in fields.items():  # LLVM keeps an array built like this in registers, not in memory
+    for name, value in fields.items():  # LLVM keeps an array in registers if insert_value sets each of its fields
         index = model.get_field_position(name)
         element = ir.Constant(array.type.elements[index], None) if value is None else value
         array = builder.insert_value(array, element, index)

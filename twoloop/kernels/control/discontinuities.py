@@ -39,7 +39,7 @@ TIME_ROUNDING = 5e3  # error of the twelfth difference due to rounding of t, rel
 STEEPNESS = 4.0  # a part of a step is a ramp if C_t or b is this many times steeper in the part than in the whole step
 MAX_RAMP_SHARE = 0.125  # only a ramp of C_t or b that takes at most this fraction of a step is located within the step
 MIN_SPACINGS = 8.0  # bisection for a jump ends if the time span is at most this many spacings of floating-point times
-SMOOTH, RAMP, JUMP = range(3)  # C_t and b in a time span are SMOOTH, or have a steep RAMP or a kink, or have a JUMP
+SMOOTH, RAMP, JUMP = range(3)  # in a time span, C_t and b are SMOOTH, have a JUMP, or have a steep ramp or kink (RAMP)
 
 
 @compiled
@@ -151,7 +151,7 @@ def locate_discontinuity(f, w, t, end, q, v, velocity, tolerances):
             return JUMP, begin, end
     if steepest > STEEPNESS * mean:
         return RAMP, low, high
-    if end - begin < h:  # one half of the step is not smooth, either: a ramp fills the step, or C_t or b has a kink
+    if end - begin < h:  # C_t or b is not smooth in one half of the step: it has a kink, or a ramp fills the step
         return RAMP, t, t + 0.5 * h
     return SMOOTH, t, t + h
 
@@ -162,31 +162,30 @@ SUDDEN_RATIO = 0.1  # a change is sudden if the second difference exceeds this f
 # a force, C_t or b counts as constant if its samples differ by at most LEAST_RANGE * rtol times the largest value so
 # far, or by at most LEAST_VALUE, as squares of smaller numbers underflow
 LEAST_RANGE, LEAST_VALUE = 0.1, 1e-150
-MIN_SAMPLES_IN_STEP = 8.0  # least number of samples in a step; stages may miss a force that lasts a quarter of a step
-RESAMPLE_BELOW = 0.25  # sample again if the time between samples must be below this fraction of the last such time
+MIN_SAMPLES_IN_STEP = 8.0  # least number of samples per step, as stages may miss a force that lasts a quarter of a step
+RESAMPLE_BELOW = 0.25  # sample again if samples must be closer than this fraction of the spacing of earlier samples
 MIN_SPACING = 16.0  # shortest time between samples, in spacings of floating-point numbers at t
 N_BISECTIONS = 20  # number of bisections that locate the time of a change between two samples
 EQUAL_CHANGES = 1e-5  # two changes are the same if their times differ by at most this part of clock[WIDEST_SAMPLING]
 # changes are not recorded until this time after the start, in units of tolerances[GAP]: just after the start, rounding
 # errors make a force that begins at zero, such as 1 - cos(t), seem to change suddenly
 MIN_RECORDED_TIME = 5e-5
-MIN_STEEPNESS_RATIO = 2.0  # a change between two samples is sudden if it exceeds this times the changes next to it
+MIN_STEEPNESS_RATIO = 2.0  # a sudden change between two samples exceeds the changes before and after it by this factor
 SHORT_STEP = 0.5  # steps below this fraction of the longest recent step are searched for pulses of forces, C_t and b
-N_SAMPLES_IN_SHORT_STEP = 4  # number of samples within a short step, in search of pulses
+N_SAMPLES_IN_SHORT_STEP = 4  # number of samples within a short step that is searched for pulses of forces, C_t and b
 # if a change of velocities by at most their tolerances changes an acceleration by more than this fraction of the
 # largest one, motion is not extrapolated with the present accelerations, see `_acceleration_lasts`
 MAX_LASTING_CHANGE = 0.5
-# a step need not end at a change if the step begins before it by at most this fraction of the time between samples
-CHANGE_MARGIN = 0.01
+CHANGE_MARGIN = 0.01  # a step ignores changes just after its start: within this fraction of the time between samples
 # w.changes has a column for each force, C_t and b; rows 0 to N_SAMPLES contain samples at successive times
 LARGEST_ROW = N_SAMPLES + 1  # row of w.changes: largest |value| of each force, C_t and b so far
-MIDDLE_ROW = N_SAMPLES + 2  # row of w.changes: one more sample, at a time between or before the other samples
+MIDDLE_ROW = N_SAMPLES + 2  # row of w.changes: a sample at a time between two of the 21 samples, or before them
 N_CHANGES = N_SAMPLES + 3  # number of rows of w.changes
 
 
 @compiled
 def _sample_forces(f, w, time, elapsed, q, v, a, values):
-    """Store forces, C_t and b at `time` in `values`; (q, v) moves for `elapsed` s with constant accelerations a."""
+    """Store forces, C_t, b at `time` in `values`, after (q, v) moved for `elapsed` s with constant accelerations a."""
     for m in range(q.size):
         w.x[m] = q[m] + elapsed * (v[m] + 0.5 * elapsed * a[m])
         w.y[m] = v[m] + elapsed * a[m]
@@ -241,7 +240,7 @@ def _first_sudden_bend(values, n, detrends, min_range):
     subtracts the straight line from the first to the last searched sample if `detrends` is 1, nothing if it is 0.
     """
     index, limit = _find_sudden_bend(values, n, detrends * (values[n] - values[0]) / max(n, 1), min_range, False)
-    while index > 1:  # skip smooth bends here (True), because a few samples of a smooth curve may bend like a jump
+    while index > 1:  # find earlier bends; skip smooth curves (`strict`), which may exceed the limit if samples are few
         slope = detrends * (values[index] - values[0]) / index
         earlier, bound = _find_sudden_bend(values, index, slope, min_range, True)
         if earlier == 0:
@@ -252,9 +251,9 @@ def _first_sudden_bend(values, n, detrends, min_range):
 
 @compiled
 def _is_sudden_change(previous, first_value, second_value, following, limit):
-    """Return True if `second_value` differs from `first_value` by more than `limit`, and much more than nearby samples.
+    """Return True if |second_value - first_value| exceeds `limit` and is much larger than both neighbouring changes.
 
-    The changes from `previous` and to `following`, unless of opposite sign, must be MIN_STEEPNESS_RATIO times smaller.
+    Only neighbouring changes of the same sign count: each must be more than MIN_STEEPNESS_RATIO times smaller.
     """
     change = second_value - first_value
     sign = 1.0 if change > 0.0 else -1.0
@@ -264,7 +263,10 @@ def _is_sudden_change(previous, first_value, second_value, following, limit):
 
 @compiled
 def _locate_change(f, w, low, high, k, j, q, v, a):
-    """Return the time just after column j of w.changes jumps between row k (time `low`) and row k + 1 (time `high`)."""
+    """Locate a jump by bisection between the times `low` and `high`; return the time just after it.
+
+    The value that jumps is in column j of w.changes, which contains its samples at these times in rows k and k + 1.
+    """
     changes = w.changes
     before, after = changes[k, j], changes[k + 1, j]
     for _ in range(N_BISECTIONS):
@@ -367,10 +369,10 @@ def _record_short_change(f, w, tolerances, control, clock, t, size, last, q, v, 
 
 @compiled
 def _acceleration_lasts(f, w, tolerances, t, duration, q, v, a, Q, V, A):
-    """Return True if the accelerations a last, so that the motion can be extrapolated with them over `duration` (s).
+    """Return True if the motion may be extrapolated over `duration` (s) with constant accelerations, the argument `a`.
 
-    They last if they hardly change when velocities change by a * `duration` or, if less, by their tolerances. If stiff
-    friction holds a body, a contains only rounding errors of balanced forces, and does not last. (Q, V, A) is scratch.
+    Accelerations must hardly change if velocities change by `a` * `duration`, reduced until no change exceeds its
+    tolerance. If stiff friction holds a body, `a` is a rounding error of its forces: return False. Q, V, A: scratch.
     """
     n, time, largest, change = w.Q.size, duration, 0.0, 0.0
     for m in range(n):
@@ -390,9 +392,9 @@ def _acceleration_lasts(f, w, tolerances, t, duration, q, v, a, Q, V, A):
 
 @compiled
 def _sample_motion(f, w, tolerances, control, clock, spacing, t, size, last, q, v, a, Q, V, A):
-    """Sample forces, C_t and b along the motion if earlier samples end within the step; find the next sudden change.
+    """Find the next sudden change of forces, C_t or b along the motion, unless the whole step has been sampled before.
 
-    Store this change in `clock`. Samples extend over max(`size`, MIN_TIME_AHEAD * `spacing`), but not beyond `last`.
+    Store its time in `clock`. Samples extend over max(`size`, MIN_TIME_AHEAD * `spacing`), but not beyond `last`.
     """
     if clock[at.MOTION_SAMPLED_TO] >= t + (1.0 - CHANGE_MARGIN) * size:
         return
@@ -407,7 +409,8 @@ def _sample_motion(f, w, tolerances, control, clock, spacing, t, size, last, q, 
             f, w, tolerances, clock, t, t, duration / N_SAMPLES, last, 1.0, q, v, A
         )
     clock[at.SAMPLES_MOTION] = 0.0
-    # if no change was found at a fixed state, samples along the motion, unless farther apart, replace the samples there
+    # if samples at a fixed state have found no change, samples along the motion replace them, unless the time between
+    # samples along the motion is longer than the longest allowed time between samples at a fixed state
     change_found = clock[at.SAMPLED_TO] == clock[at.DISCONTINUITY] > t
     if not change_found and duration <= N_SAMPLES * min(control[at.TIME_SPACING], size / MIN_SAMPLES_IN_STEP):
         clock[at.WIDEST_SAMPLING] = max(clock[at.WIDEST_SAMPLING], duration / N_SAMPLES)
@@ -425,13 +428,13 @@ def _sample_ahead(f, w, tolerances, control, clock, next_change, t, size, last, 
     This is `next_change`, which was known before (infinite: none), or an earlier change. No sample is after `last`.
     """
     max_spacing = max(min(control[at.TIME_SPACING], size / MIN_SAMPLES_IN_STEP), MIN_SPACING * np.spacing(abs(t)))
-    # if samples must be much closer now, times are sampled again. Multistep methods (JUMP_RATIO = 1) do not need this,
+    # if samples must be much closer than before, sample again. Multistep methods (JUMP_RATIO = 1) do not need this,
     # because their error estimates show a jump, nor do runs in which each step is checked for jumps (MAY_JUMP = 1)
     may_resample = control[at.JUMP_RATIO] > 1.0 and control[at.MAY_JUMP] == 0.0
     if may_resample and max_spacing < RESAMPLE_BELOW * clock[at.SAMPLED_EVERY]:
         clock[at.SAMPLED_TO] = t
     begin = max(t, clock[at.SAMPLED_TO])
-    is_at_change = clock[at.DISCONTINUITY] == clock[at.SAMPLED_TO]  # if True, sample at least as closely as last time
+    is_at_change = clock[at.DISCONTINUITY] == clock[at.SAMPLED_TO]  # if so, the spacing of samples must not increase
     while begin < min(t + size, last, next_change):
         spacing, is_at_change = min(max_spacing, clock[at.SAMPLED_EVERY]) if is_at_change else max_spacing, False
         clock[at.WIDEST_SAMPLING] = max(clock[at.WIDEST_SAMPLING], spacing)
@@ -457,8 +460,8 @@ def limit_to_discontinuity(f, w, tolerances, control, clock, t, size, last, stat
     next_change = clock[at.DISCONTINUITY] if clock[at.DISCONTINUITY] > t_near else np.inf
     next_change_of_motion = clock[at.DISCONTINUITY_OF_MOTION] if clock[at.DISCONTINUITY_OF_MOTION] > t_near else np.inf
     is_at_change = next_change == np.inf and clock[at.DISCONTINUITY] == clock[at.SAMPLED_TO] > -np.inf
-    # if a step begins at a change and is as short as one spacing, do not sample again: closer and closer samples would
-    # show this change again and again
+    # if the step begins at a change and is no longer than the time between samples, do not sample again: closer and
+    # closer samples would show this change again and again
     if control[at.BY_TIME] == 1.0 and not (is_at_change and size <= (1.0 + CHANGE_MARGIN) * clock[at.SAMPLED_EVERY]):
         next_change = _sample_ahead(f, w, tolerances, control, clock, next_change, t, size, last, q, v, a)
         clock[at.DISCONTINUITY] = next_change

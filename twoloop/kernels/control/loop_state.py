@@ -28,7 +28,7 @@ CONTINUE = -1  # value that functions return in place of an end code if the loop
 
 # indices of the N_RULE parameters of step-size control. The next step size is SAFETY * error**-EXPONENT times the size
 # of this step (`error`: of this step, in tolerances), but FACTOR_MIN times this size at least and FACTOR_MAX times at
-# most. If LEAST_ERROR > 0, the error of the previous step, at least LEAST_ERROR, also counts (Hairer & Wanner II, IV.8)
+# most. If LEAST_ERROR > 0, the larger of LEAST_ERROR and the previous error also counts (Hairer & Wanner II, IV.8)
 SAFETY, EXPONENT, FACTOR_MIN, FACTOR_MAX, LEAST_ERROR, N_RULE = range(6)
 # indices of the N_PAST numbers in the history: size (s) and error (in tolerances) of the last accepted step
 H_BEFORE, ERROR_BEFORE, N_PAST = range(3)
@@ -58,7 +58,7 @@ H_BEFORE, ERROR_BEFORE, N_PAST = range(3)
     TIME_SPACING,  # longest time (s) between samples of the forces at a fixed state, see discontinuities.py
     SAMPLE_MOTION,  # 1: forces may be sampled along predicted motion; 0: no more, since a callback raised an exception
     BY_TIME,  # 1: a force or a constraint rate (C_t, b) may change suddenly with time; 0: none does
-    BY_STATE,  # 1: a force may change suddenly with q or v: steps longer than SPACING sample the motion; 0: none does
+    BY_STATE,  # 1: a force may change suddenly with q or v, and is sampled in steps longer than SPACING; 0: none does
     FIRST_GIVEN,  # 1: the user has chosen the first step size; 0: it is a guess, and may grow before a step is accepted
     MAX_EVALUATION_GAP,  # longest time in a step between two evaluations of the equations, relative to the step size
     TAKES_MANY,  # 1: the method has `attempt_many`, which takes steps without checks between them; 0: it does not
@@ -88,16 +88,16 @@ H, ERRORS, FAILURES, PARTITIONS, JACOBIANS, N_STEP_COLUMNS = range(6)
     JUMP_TO,  # end (s) of the short time span with the next known jump of a constraint rate (C_t, b)
     APPLIES_JUMP,  # 1: the next step ends at JUMP_TO, in the state that `new_state` already contains; 0: ordinary step
     JUMP_END,  # end (s) of the last step rejected with a very large error: a force may jump before this time
-    # fixed-order form: smallest pivot after the last accepted step, or after a later step that `ends_near_singular`
+    # smallest pivot at the end of the last step accepted, or rejected by `ends_near_singular` (fixed-order form)
     PIVOT_HERE,
     # forces, C_t and b are sampled ahead of a step, at a fixed state (where the step starts) or along predicted motion
     SAMPLED_TO,  # time (s) of the last sample at a fixed state
-    SAMPLED_EVERY,  # time (s) from one sample at a fixed state to the next, in the last set of samples
+    SAMPLED_EVERY,  # spacing (s) of the last samples of forces before SAMPLED_TO
     WIDEST_SAMPLING,  # longest time (s) so far from one sample of the forces to the next
-    DISCONTINUITY,  # time (s) of the next sudden change that samples at a fixed state show; infinite: none is known
-    DISCONTINUITY_OF_MOTION,  # time (s) of the next sudden change that samples along the motion show; infinite: unknown
+    DISCONTINUITY,  # time (s) of the next sudden change of a force, C_t or b at a fixed state; infinite: none is known
+    DISCONTINUITY_OF_MOTION,  # time (s) of the next sudden change of a force, C_t or b in the motion; infinite: unknown
     COMPARED,  # start time (s) of the last short step that was searched for pulses of a force
-    LAST_CHANGE,  # time (s) of the last sudden change of a force, C_t or b; -infinite: none
+    LAST_CHANGE,  # time (s) of the last sudden change of a force, C_t or b; -inf: none
     SHORTEST_CHANGE,  # shortest time (s) from one sudden change of a force, C_t or b to the next; infinite: unknown
     MOTION_SAMPLED_TO,  # time (s) of the last sample along the motion
     SAMPLES_MOTION,  # 1 while callbacks are called at predicted states, where exceptions do not end a run; otherwise 0

@@ -20,7 +20,7 @@ SHRINKAGE = 0.8  # if a step with projected stages is rejected or fails, it is r
 MIN_STEP_NEAR_SINGULAR = 0.001  # shortest useful step near a singular position, relative to the longest recent step
 # if no crossing can be attempted, the run ends when the smallest pivot is below this fraction of its maximum in the run
 UNDETERMINED_PIVOT = 1e-6
-CHECK_INTERVAL = 16  # number of steps between checks of the partition if generated code runs, which needs no partition
+CHECK_INTERVAL = 16  # steps of generated code need no partition, so only one in this number of such steps checks it
 # in the augmented form, with n degrees of freedom, the partition is checked every 1 + n // FREEDOMS_PER_CHECK steps,
 # because each check computes the null space of [C_q; A], a dense matrix that steps in this form do not need
 FREEDOMS_PER_CHECK = 32
@@ -40,8 +40,8 @@ MIN_END_RATIO = 0.25  # `ends_near_singular` is True only if the smallest pivot 
 def is_near_singular(f, w, control, clock, t, q):
     """Return True if a singular position is near the accepted position q at time t, and control[MAY_CROSS] is 1.
 
-    A position is near if the smallest pivot of C_q is small, or if no partition can be chosen. Compute this pivot for a
-    new partition if its last value, w.pivot, is small, or may be old because generated code took the last steps.
+    A singular position is near if the smallest pivot of C_q is small, or if no partition can be chosen. Compute this
+    pivot for a new partition if its last value, w.pivot, is small or may be old, as generated code took the last steps.
     """
     if control[at.MAY_CROSS] != 1.0:
         return False
@@ -91,7 +91,7 @@ def prepare_projected_repetition(f, w, control, clock, size):
 
 @merged
 def near_pivot_ratio(tolerances):
-    """Return the part of clock[LARGEST_PIVOT] below which pivots let rounding errors exceed MAX_ROUNDING_ERROR."""
+    """Return the ratio pivot / clock[LARGEST_PIVOT] below which rounding errors may exceed MAX_ROUNDING_ERROR."""
     return min(max(MIN_NEAR_RATIO, (EPS / (MAX_ROUNDING_ERROR * tolerances[LEAST])) ** (1.0 / 3.0)), MAX_NEAR_RATIO)
 
 
@@ -151,8 +151,8 @@ def record_pivot_at_output(f, w, clock, state):
     """Set clock[PIVOT_AT_OUTPUT] to the smaller of its value and the pivot ratio at `state`, see `min_pivot_ratio`."""
     pivot = min_pivot_ratio(f, w, clock[at.T], state[: w.Q.size])
     if f.form == FIXED_ORDER and pivot > 0.0:
-        # pivots of the fixed-order form are sines of angles between rows. In large mechanisms, all of them are small:
-        # only a smallest pivot far below its largest value so far, clock[LARGEST_PIVOT], shows a singular position
+        # pivots of the fixed-order form are sines of angles between rows, all small in large mechanisms. So a singular
+        # position is near only if the smallest pivot is far below clock[LARGEST_PIVOT], its largest value so far
         pivot /= max(pivot, clock[at.LARGEST_PIVOT])
     clock[at.PIVOT_AT_OUTPUT] = min(clock[at.PIVOT_AT_OUTPUT], pivot)
 
@@ -183,7 +183,7 @@ def check_partition(f, w, control, clock, size, at_output, state):
         find_tangents(f, w, clock[at.T], state[:n])
     if is_checked and partition_is_poor(w) and renew_partition(f, w, clock[at.T], state[:n]) != DONE:
         return at.RANK_LOST
-    # near_now = 2: steps of generated code, which do not update w.pivot, request its value at this state
+    # w.near_now is 2 if a step of generated code, which does not update w.pivot, requests this pivot
     if f.is_generated == 1 and w.near_now == 2.0 and renew_partition(f, w, clock[at.T], state[:n]) != DONE:
         return at.RANK_LOST
     clock[at.LARGEST_PIVOT] = max(clock[at.LARGEST_PIVOT], w.pivot)
@@ -198,7 +198,7 @@ def check_partition(f, w, control, clock, size, at_output, state):
         if w.pivot < SINGULAR_PIVOT * clock[at.LARGEST_PIVOT]:
             w.nearly_singular = w.near_now = 1.0
     if short and size < MIN_STEP_NEAR_SINGULAR * clock[at.H_LONG] and w.nearly_singular == 1.0:
-        # steps of an implicit method may be this short because its partition was chosen at a distant state: renew it
+        # renew the partition: if it was chosen at a distant state, steps of an implicit method may become too short
         if renew_partition(f, w, clock[at.T], state[:n]) != DONE:
             return at.RANK_LOST
         if control[at.MAY_CROSS] != 1.0 and w.pivot < UNDETERMINED_PIVOT * clock[at.LARGEST_PIVOT]:

@@ -66,7 +66,7 @@ def record_accepted_step(rule, past, h, error):
 @compiled
 def project_and_evaluate(f, w, t, Q, V, A):
     """Project the state (Q, V) onto the constraints; store its accelerations in A; return DONE or a failure code."""
-    # in generated code, the task PROJECT costs less than EVALUATE; in the fixed-order form, EVALUATE does not project
+    # the task EVALUATE is slower than PROJECT with generated code, and need not project in the fixed-order form
     if (f.is_generated == 1 and w.Rate.size == w.C.size) or f.form == FIXED_ORDER:
         return f.inner(f, w, PROJECT, t, Q, V, INNER_TOL, A, w.lam)
     return evaluate(f, w, t, Q, V, INNER_TOL, A)
@@ -85,7 +85,7 @@ def size_on_grid(clock, t, h, target, goal):
     """Choose the size of a step from t in a run with steps of fixed size h, which end at the grid times T_START + k h.
 
     Return the size (s), the number of grid times that the step reaches (0 or 1), and True if it reaches `goal`.
-    `target`: next output time; a grid time counts as equal if it differs by at most h / 10^6. `goal`: `target`, or the
+    `target`: next output time; a grid time within h / 10^6 of `target` counts as equal to it. `goal`: `target`, or the
     time of a jump of a constraint rate (C_t, b) before `target`.
     """
     rounding = EQUAL_SPACINGS * np.spacing(max(abs(t), abs(target)))
@@ -105,7 +105,7 @@ def size_on_grid(clock, t, h, target, goal):
 
 @merged
 def size_off_grid(control, t, h, time_to_goal, crosses_jump):
-    """Return a step size (s) of at most about h, and whether the step must take `time_to_goal` (s) instead."""
+    """Return a step size (s), about h or less, and True if the step must have the size `time_to_goal` (s) instead."""
     reaches_goal = crosses_jump or h >= time_to_goal * (1.0 - 1e-10)
     size = h
     if h > 0.5 * time_to_goal and not reaches_goal:
@@ -121,7 +121,7 @@ H_LONG_DECAY = 0.98  # factor by which each accepted step reduces clock[H_LONG],
 
 @merged
 def count_step(w, tolerances, control, clock, size, out_step):
-    """Record an accepted step of `size` (s) in `out_step`, statistics in `w`, and the longest recent size, H_LONG."""
+    """Store an accepted step of `size` (s) in `out_step`, counts in `w`, and the longest recent size in `clock`."""
     w.n_accepted += 1
     if w.defect >= 0.0:
         w.largest_defect = max(w.largest_defect, w.defect)
@@ -130,7 +130,7 @@ def count_step(w, tolerances, control, clock, size, out_step):
     gap = size
     if w.defect >= 0.0:
         gap = min(size, tolerances[DEFECT_GAP])
-    elif is_beyond_gap(tolerances, size):  # only steps with evaluations within them may be so long
+    elif is_beyond_gap(tolerances, size):  # a step longer than tolerances[GAP] also evaluates forces within the step
         gap = control[at.MAX_EVALUATION_GAP] * size
     w.widest_gap = max(w.widest_gap, gap)
     clock[at.H_LONG] = max(size, H_LONG_DECAY * clock[at.H_LONG])
@@ -160,8 +160,8 @@ def store_prediction(w, q1):
 def prediction_error(w, tolerances, h, q, v, q1):
     """Return the largest |w.predicted - q1| (dependent positions) / (allowed error), for a step from (q, v) to q1.
 
-    The formula predicted w.predicted; q1 satisfies the constraints. The allowed error is the tolerance or, if smaller,
-    about FRACTION_OF_MOTION (if det C_qd changes sign: FRACTION_AT_SIGN_CHANGE) times the largest displacement.
+    The formula predicted w.predicted; q1 satisfies C = 0. The allowed error is the tolerance or, if smaller, about a
+    fraction of the largest displacement: FRACTION_OF_MOTION, or FRACTION_AT_SIGN_CHANGE if det C_qd changes sign.
     w.orientation_new becomes the sign of det C_qd, from its factors in `w`. If steps have a fixed size, only return 0.
     """
     if tolerances[ESTIMATE] == 0.0:

@@ -53,23 +53,23 @@ from twoloop.kernels.linalg.dense import copy
 # the largest rate is first estimated after FIRST_ESTIMATE evaluations of the equations, later every BETWEEN_ESTIMATES
 # evaluations. While the explicit method is active, both numbers are multiplied by options[COST_RATIO]
 FIRST_ESTIMATE, BETWEEN_ESTIMATES = 100.0, 600.0
-N_POWER_ITERATIONS = 4  # power iterations by dF/dq in an estimate (F: accelerations), and at most this number by dF/dv
-NEGLIGIBLE_DAMPING = 1e-3  # power iterations by dF/dv (F: acceleration) end if eigenvalue * step size is below this
+N_POWER_ITERATIONS = 4  # number of power iterations with dF/dq, and largest number with dF/dv (F: accelerations)
+NEGLIGIBLE_DAMPING = 1e-3  # power iterations with dF/dv (F: accelerations) end if eigenvalue * step size is below this
 ZERO_REPLACEMENT = 1e-3  # replaces zero components of the vector of a power iteration, whose largest component is 1
-URGENT_RATIO = 3.0  # no cost delays a trial (it is urgent) if step size * (largest rate) / stability limit exceeds this
+URGENT_RATIO = 3.0  # a trial is urgent (cost cannot delay it) if step size * largest rate / stability limit > this
 # if Jacobians are computed by finite differences (about eight evaluations per coordinate), a trial that is not urgent
 # (see URGENT_RATIO) also waits until the run has cost this number of evaluations per independent coordinate
 MIN_COST_PER_COORDINATE = 64.0
 TRIAL_COST = 300.0  # approximate cost of a trial of the implicit method, in evaluations of the implicit method
-MIN_COST_IN_TRIALS = 3.0  # a trial that is not urgent (URGENT_RATIO) waits until the run has cost this number of trials
-COUNTED_FRACTION_OF_RUN = 0.3  # the cost so far counts as at least this fraction of the expected cost of the whole run
+MIN_COST_IN_TRIALS = 3.0  # unless urgent (URGENT_RATIO), a trial waits until cost of the run / cost of a trial > this
+COUNTED_FRACTION_OF_RUN = 0.3  # when a trial is considered, a run's cost counts as at least this * its expected total
 # however small the largest rate is, a first trial begins when the run has cost as much as
 # COST_OF_ANY_TRIAL * MIN_COST_IN_TRIALS trials. After k trials, the next one begins at k + 1 times this cost
 COST_OF_ANY_TRIAL = 100.0
 MIN_RATIO_TO_MOTION = 30.0  # the largest rate is far above `_motion_rate` if it exceeds this times `_motion_rate`
 QUIET_FACTOR = 10.0  # vibrations count as small if their velocities are at most this number of tolerances
-# small vibrations, or a largest rate far above `_motion_rate`, are reasons for a trial only if step size *
-# (largest rate) / (stability limit) exceeds this
+# a trial may begin because vibrations are small, or because the largest rate is far above `_motion_rate`, but only if
+# step size * (largest rate) / (stability limit) exceeds this
 MIN_HIDDEN_RATIO = 0.05
 DIFFERENCE_STEP = 1e-4  # time step of the finite difference in `_motion_rate`, relative to 1 / (largest rate)
 RETURN_BELOW = 0.4  # the explicit method is tried again if step size * (largest rate) / (stability limit) is below this
@@ -94,8 +94,8 @@ LIMIT, N_ESTIMATES, MATRIX_COST, COST_RATIO, SIZE_1, N_PAIR = range(6)
 REUSE_OF, N_OF_EACH = N_RULE, N_RULE + 1
 N_OPTIONS = N_PAIR + 2 * N_OF_EACH  # index in `options` where the options of the first method begin
 
-# indices of the first N_SCALARS numbers in `memory`. The vectors (n_q each) of the power iterations by dF/dq and dF/dv
-# (F: accelerations) follow, then the memories of both methods
+# indices of the first N_SCALARS numbers in `memory`. The vectors (n_q each) of the power iterations with dF/dq and
+# dF/dv (F: accelerations) follow, then the memories of both methods
 (
     PHASE,  # which method is in use or on trial: EXPLICIT, ON_TRIAL, IMPLICIT or BACK_ON_TRIAL
     STEPS,  # number of accepted steps since PHASE, the method in use or on trial, last changed
@@ -114,8 +114,8 @@ N_OPTIONS = N_PAIR + 2 * N_OF_EACH  # index in `options` where the options of th
     H_TRIED,  # size of the last attempted step (s)
     ERROR_TRIED,  # error of the last attempted step, in tolerances
     N_TRIALS,  # number of trials so far
-    # number of estimates of step size * (largest rate) above LIMIT. A lower estimate sets the number to 0, unless the
-    # run has cost too little for a trial
+    # number of estimates of step size * (largest rate) that were above LIMIT. An estimate below LIMIT sets the number
+    # to 0 if a trial is cheap, compared with the cost of the run
     N_ABOVE_LIMIT,
     N_SCALARS,
 ) = range(19)
@@ -135,7 +135,7 @@ def switching_options(
     `limit`, `estimates`, `matrix_cost` and `ratio` are the values of LIMIT, N_ESTIMATES, MATRIX_COST and COST_RATIO.
     `rules` has a row of N_OF_EACH numbers (see LIMIT) for each method. `first` and `second`: the methods' own options.
     """
-    first = np.asarray(first)  # contains numbers or, in code for all parameters, expressions of parameters
+    first = np.asarray(first)  # numbers or, if one trace serves all values of parameters, `Parameter` objects
     scalars = [limit, float(estimates), matrix_cost, ratio, float(first.size)]
     return np.concatenate([scalars, np.asarray(rules, dtype=np.float64).ravel(), first, np.asarray(second)])
 
@@ -204,7 +204,7 @@ def _largest_rate(f, w, memory, t, state, new_state):
     by_q, by_v = memory[N_SCALARS : N_SCALARS + n], memory[N_SCALARS + n : N_SCALARS + 2 * n]
     Q, V, A = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n]
     growth_by_q = growth_by_v = 0.0
-    # generated code does not renew the partition, whose independent coordinates may hardly move now: choose a new one
+    # generated code does not renew the partition: its independent coordinates may hardly move now, so choose others
     is_explicit = memory[PHASE] == EXPLICIT
     if is_explicit and f.is_generated == 1 and renew_partition(f, w, t, state[:n]) != DONE:
         return 0.0
@@ -214,7 +214,7 @@ def _largest_rate(f, w, memory, t, state, new_state):
         growth_by_v = _power_iteration(f, w, t, state, by_v, True, Q, V, A)
         if growth_by_v * memory[H_MEAN] < NEGLIGIBLE_DAMPING:
             break
-    for m in range(n):  # a zero component could stay zero, and the motion of its coordinate would not be seen later
+    for m in range(n):  # a zero in the vector by_q or by_v could stay zero, and hide the motion of its coordinate
         if by_q[m] == 0.0:
             by_q[m] = ZERO_REPLACEMENT
         if by_v[m] == 0.0:
@@ -226,7 +226,7 @@ def _largest_rate(f, w, memory, t, state, new_state):
 def _motion_rate(f, w, t, state, rate, Q, V, A):
     """Return the rate (1/s) at which the motion changes: the larger of max|a| / max|v| and max|da/dt| / max|a|.
 
-    Return inf if this is unknown. `rate`: largest rate rho, which sets the time step for da/dt. (Q, V, A): scratch.
+    Return inf if v or a is zero, or da/dt is unknown. `rate`: largest rate, see DIFFERENCE_STEP. (Q, V, A): scratch.
     """
     n = Q.size
     dt = DIFFERENCE_STEP / rate
@@ -305,7 +305,7 @@ def _judge_trial(w, options, memory, t):
 
 @compiled
 def _phase_to_begin(f, w, options, memory, tolerances, t, state, new_state):
-    """Estimate the largest rate. If a trial must begin, return its phase, ON_TRIAL or BACK_ON_TRIAL, otherwise -1."""
+    """Estimate the motion's largest rate; return ON_TRIAL or BACK_ON_TRIAL if this trial must begin now, else -1."""
     n = w.Q.size
     memory[RATE] = _largest_rate(f, w, memory, t, state, new_state)
     cost_per_second, cost = _cost_per_second(w, options, memory, t), _cost_of_run(w, options)
@@ -317,8 +317,8 @@ def _phase_to_begin(f, w, options, memory, tolerances, t, state, new_state):
         memory[N_ABOVE_LIMIT] += 1.0
     if memory[ESTIMATES_TO_WAIT] > 0.0:
         return -1
-    # `counted` is the cost of the run so far or, if larger, a fraction of the expected cost of the whole run. Unless a
-    # trial is cheap compared with `counted`, it begins only if h_rho exceeds URGENT_RATIO
+    # `counted` is the cost of the run so far or, if larger, a fraction of the expected cost of the whole run. If a
+    # trial is not cheap compared with `counted`, it begins only if it is urgent, that is, if h_rho > URGENT_RATIO
     counted, min_cost = cost, MIN_COST_IN_TRIALS * TRIAL_COST * options[COST_RATIO]
     if np.isfinite(tolerances[GAP]):
         counted = max(counted, COUNTED_FRACTION_OF_RUN * tolerances[GAP] / MAX_GAP_RATIO * cost_per_second)
@@ -331,15 +331,16 @@ def _phase_to_begin(f, w, options, memory, tolerances, t, state, new_state):
         is_hidden = _has_small_vibrations(w, tolerances, state, memory[RATE])
         if not is_hidden:
             is_hidden = memory[RATE] > MIN_RATIO_TO_MOTION * _motion_rate(f, w, t, state, memory[RATE], Q, V, A)
-    # a costly run starts a trial however small the largest rate is: friction is stiff only while it reverses, and few
-    # estimates fall into this time. Short steps at the start make a run look costly: so require cost > min_cost
+    # if a run is costly, a trial begins even if the largest rate is small: friction is stiff only while it reverses,
+    # and all estimates may fall outside these short times. As first steps are short, `counted` may be too large early
+    # in a run; therefore cost > min_cost is also required
     is_costly = is_cheap and cost > min_cost and counted > COST_OF_ANY_TRIAL * min_cost * (1.0 + memory[N_TRIALS])
     is_due = (
         h_rho > URGENT_RATIO or is_hidden or is_costly or (memory[N_ABOVE_LIMIT] >= options[N_ESTIMATES] and is_cheap)
     )
-    if is_cheap and h_rho <= 1.0:  # otherwise, keep N_ABOVE_LIMIT, which may start a trial later
+    if is_cheap and h_rho <= 1.0:  # as long as a trial is not cheap, keep N_ABOVE_LIMIT, which may start a trial later
         memory[N_ABOVE_LIMIT] = 0.0
-    is_expensive = cost_per_second > MIN_GAIN * memory[COST_PER_SECOND]  # more than with the explicit method
+    is_expensive = cost_per_second > MIN_GAIN * memory[COST_PER_SECOND]  # compared with the explicit method
     if (memory[PHASE] == EXPLICIT and is_due) or (memory[PHASE] == IMPLICIT and (h_rho < RETURN_BELOW or is_expensive)):
         memory[COST_PER_SECOND] = cost_per_second
         memory[N_TRIALS] += 1.0
@@ -395,14 +396,14 @@ def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
     w.reuse = max(rule[REUSE_OF], w.rounded)
     if is_explicit:
         code, error, factor = f.attempt_first(f, w, options[N_OPTIONS:begin], first, t, h, tolerances, state, new_state)
-        # a step of fixed size that does not converge cannot be shortened: switch to the implicit method, and repeat it
+        # a step of fixed size that does not converge cannot be shortened: repeat this step with the implicit method
         if code == OUTER_DIVERGED and tolerances[ESTIMATE] == 0.0 and f.form != FIXED_ORDER:
             _begin_phase(w, options, memory, IMPLICIT, t)
             second[:] = 0.0
             w.explicit_step = 0.0
             code, error, factor = f.attempt_second(f, w, options[begin:], second, t, h, tolerances, state, new_state)
     else:
-        # the second method does not evaluate the equations within its steps: reject steps longer than tolerances[GAP]
+        # reject steps that exceed tolerances[GAP], the longest allowed time between evaluations of the equations
         ratio = gap_ratio(tolerances, h)
         if ratio > 0.0:
             return Attempt(DONE, ratio, 1.0 / ratio)

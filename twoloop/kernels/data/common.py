@@ -60,11 +60,11 @@ class Work(NamedTuple):
     # and the others are 0. Last row: dependent velocities due to drives (C_t and b) if all independent ones are 0
     D: Any  # (n_dof + 1, r_v) dependent velocities per unit of each independent one; last row: those due to drives
     Gx: Any  # (n_c + n_a, n_q) constraint Jacobian at a displaced position; scratch for full pivoting
-    G_of_S: Any  # (n_c + n_a, n_q) if M is constant: the G for which S and W were computed; NaN: S and W are invalid
+    G_of_S: Any  # (n_c + n_a, n_q) if M is constant: the G in S = G M^-1 G^T and W = G M^-1; NaN: S and W are invalid
     pattern: Any  # (n_c + n_a, n_q) 1 for entries of the constraint Jacobian that have been nonzero in the run, else 0
     mass_pattern: Any  # (n_q, n_q) 1 for entries of M that have been nonzero, else 0; only in the form AUGMENTED
-    row_entries: Any  # for each row of G, index in this array at which its list of nonzero columns begins; lists follow
-    Gamma_tried: Any  # (2, n_c + n_a) Gamma by differences: row 0 with 2 * time step, row 1 with the previous time step
+    row_entries: Any  # row_entries[row_entries[i] : row_entries[i + 1]]: columns of row i of G where `pattern` is 1
+    Gamma_tried: Any  # (2, n_c + n_a) Gamma by differences. Row 0: doubled time step; row 1: time step tried before
     rates: Any  # (13, n_c + n_a) constraint rates C_t and b at 13 times within a step, see discontinuities.py
     changes: Any  # (N_CHANGES, n_q + n_c + n_a) samples of forces and constraint rates, see discontinuities.py
     Q: Any  # (n_q) generalized forces
@@ -103,9 +103,9 @@ class Work(NamedTuple):
     jacobian_values: Any  # nonzero entries of C_q, in the order of linalg/symbolic_factorization.py
     is_independent: Any  # (n_c) 1 for independent rows of C_q, 0 for redundant rows
     factors: Any  # factors of the augmented matrix; f.ldl_program contains the index of each entry
-    pivot_sizes: Any  # (n_q + n_c) squared norms of rows, to which the pivots are compared, see linalg/sparse_ldl.py
+    pivot_sizes: Any  # (n_q + n_c) squared norms of rows of C_q, to which pivots are compared, see linalg/sparse_ldl.py
     unknowns: Any  # (n_q + n_c) right-hand side when a solver is called, solution when it returns
-    solutions: Any  # (3 (n_q + n_c)) scratch; then (n_c) a number s for each row g of C_q: s g^T g is added to M
+    solutions: Any  # 3 (n_q + n_c) scratch numbers; then n_c factors s, one per row g of C_q: s g^T g is added to M
 
     sizes: Any = None  # the numbers that determine the sizes of all arrays, see `Sizes` in layout.py
     address: Any = 0  # address of the field `table` in memory; kernels receive this address as their argument `w`
@@ -189,17 +189,17 @@ KIT.add_function("attempt_many", MANY)
 # a boolean result return False, and write no results, if the code is not valid at this state, as pivots are too small
 OWN_FUNCTIONS = {
     # functions of a state: arguments (t, q, v, f.numbers), then the arrays of results that the comments name
-    "own_accelerate": types.boolean(f8, VECTOR, VECTOR, VECTOR, VECTOR),  # store accelerations
+    "own_accelerate": types.boolean(f8, VECTOR, VECTOR, VECTOR, VECTOR),  # store accelerations; False: code not valid
     "own_correct_positions": types.boolean(f8, VECTOR, VECTOR, VECTOR, VECTOR, VECTOR),  # store change of q and new q
     "own_project": types.boolean(f8, *[VECTOR] * 8),  # store accelerations, change of q, new q, new v, multipliers
     "own_redundant": types.boolean(f8, VECTOR, VECTOR, VECTOR, VECTOR),  # return True if redundant rows are satisfied
     # functions of collocation steps; `memory` is described in data/collocation.py, `numbers` is f.own_numbers
     "attempt_nodes": f8(*[VECTOR] * 4),  # (memory, state, tolerances, numbers): solve for stages; return a code
     "audit_nodes": f8(*[VECTOR] * 3),  # (memory, state, numbers): return the largest defect between nodes; -1: failure
-    "retry_nodes": types.none(*[VECTOR] * 2),  # (memory, state): predict a shorter step from a rejected one
+    "retry_nodes": types.none(*[VECTOR] * 2),  # (memory, state): store a rejected step's polynomial for a shorter step
     "end_nodes": types.none(*[VECTOR] * 3),  # (memory, state, new_state): compute the state at the end of the step
     "correct_ends": types.none(*[VECTOR] * 2),  # (memory, numbers): move the ends of 8 steps at once towards C = 0
-    "project_ends": types.none(*[VECTOR] * 2),  # (memory, numbers): project the ends of 8 steps at once; find a, lam
+    "project_ends": types.none(*[VECTOR] * 2),  # (memory, numbers): project the ends of 8 steps, and store a, lam
 }
 KIT.add_llvm_functions(OWN_FUNCTIONS)
 
@@ -233,7 +233,7 @@ def _imported_modules(text: str) -> set[str]:
 
 @cache
 def source_digest(module: str) -> str:
-    """Return a hash of all sources on which the machine code of a module depends: part of its key in the cache on disk.
+    """Return a hash of all sources on which a module's machine code depends, for the key of this code on disk.
 
     These are the source of `module` (a name below twoloop.kernels, such as "steps.stages"), the sources of all modules
     that it imports, directly or not, and the signatures of callbacks.
@@ -307,7 +307,7 @@ class Kit:
     `functions`: callbacks and data of the system. `own`: functions generated for the mechanism, if any. `inner`: the
     inner loop, which may call `own`. `general`: the inner loop for any mechanism, for what generated code cannot do.
     `step`: functions of the method, or None if no kernel calls them. `first`, `second`: functions of two methods
-    between which the run may switch. `numbers`, `own_numbers`: data of generated functions of states, collocation.
+    between which the run may switch. Generated functions of a state read `numbers`, those of a step `own_numbers`.
     """
 
     def __init__(
@@ -410,7 +410,7 @@ TINY = 1e-300  # smallest result of `smallest_size`, which avoids divisions by z
 
 @merged
 def smallest_size(rtol, atol):
-    """Return the size that smaller coordinates and velocities count as: the smallest atol / rtol, at most 1."""
+    """Return the lower limit of typical sizes of q and v: the smallest atol / rtol of all coordinates, at most 1."""
     size = 1.0
     if rtol > 0.0:
         for each in atol:
@@ -420,21 +420,18 @@ def smallest_size(rtol, atol):
 
 @merged
 def limited_size(largest, least):
-    """Return `largest`, a norm, if it is between `least` (see `smallest_size`) and 1; else the nearer of both.
-
-    If both norm and `least` are 0, the result is 1.
-    """
+    """Return the norm `largest`, clipped to [`least`, 1]; 1 if both arguments are 0. `least`: see `smallest_size`."""
     size = min(max(least, largest), 1.0)
     return size if size > TINY else 1.0
 
 
 @merged
 def typical_size(tolerances, x):
-    """Return the typical size of x (q or v): max|x_k|, see `limited_size`.
+    """Return the typical size of x (q or v): max|x_k|, limited by `limited_size`.
 
     Smaller components count as this size. If it were 1 for a mechanism of 1e-9 m, finite differences would displace q
     by 1e-7 m, and a correction of 1e-14 m would count as rounding. As x may be rounding errors, such as velocities at
-    rest, the size is at least `smallest_size`, where the absolute tolerance begins to count.
+    rest, the size is at least `smallest_size`: below it, absolute tolerances exceed relative ones.
     """
     largest = 0.0
     for each in x:
@@ -461,7 +458,7 @@ def is_beyond_gap(tolerances, h):
 
 @merged
 def gap_ratio(tolerances, h):
-    """Return h / tolerances[GAP] if a step of size h must be rejected because it `is_beyond_gap`, else 0."""
+    """Return h / (longest allowed time between evaluations) if a step of size h is rejected as too long, else 0."""
     if tolerances[ESTIMATE] == 1.0 and is_beyond_gap(tolerances, h):
         return h / tolerances[GAP]
     return 0.0

@@ -32,10 +32,10 @@ from twoloop.kernels.compile.callbacks import OPTIONAL_KINDS
     FORM,  # algebra that solves for accelerations and multipliers: MULTIPLIERS, NULL_SPACE, AUGMENTED or FIXED_ORDER
     DENSE_FORM,  # value that FORM gets instead of AUGMENTED if the sparse factors exceed the limits in markowitz_lu.py
     IS_GENERATED,  # 1: the inner loop is code generated for the mechanism; 0: it is general code for any mechanism
-    FIRST_GIVEN,  # index of the first flag of an optional callback, see GIVEN
+    FIRST_GIVEN,  # index of the first of the flags that say which optional callbacks the user gives, see GIVEN
 ) = range(7)
 MULTIPLIERS, NULL_SPACE, AUGMENTED, FIXED_ORDER = range(4)  # values of FORM, see saddle_point.py, sparse_inner_loop.py
-# by name of an optional callback: index in Functions.flags of its flag, 1 if the user gives this callback, else 0
+# for each optional callback: index, in Functions.flags, of a flag that is 1 if the user gives this callback, else 0
 GIVEN = {name: index for index, name in enumerate(OPTIONAL_KINDS, FIRST_GIVEN)}
 N_FLAGS = FIRST_GIVEN + len(GIVEN)
 FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN, REACTION_BY_Q_GIVEN, MASS_VALUES_GIVEN = (
@@ -66,18 +66,18 @@ FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN, REACTION_BY_Q_GIVEN, MASS_VALUES_GIVEN = (
     GAMMA_REQUIRED,  # allowed error of Gamma by finite differences (evaluation/constraints.py), relative to GAMMA_SCALE
     GAMMA_STEP_RATIO,  # time step of finite differences for Gamma, relative to the result of `largest_difference_step`
     GAMMA_ACCURACY,  # error of Gamma, relative to GAMMA_SCALE, when GAMMA_STEP_RATIO was chosen last
-    GAMMA_SCALE,  # size to which errors of Gamma are compared: largest |entry| of Gamma, or sum of |G_ij a_j|, so far
-    REUSE,  # the inner loop keeps C_q and its factors after a correction of positions of at most this size
-    ROUNDED,  # rounding error of positions; at ends of steps, C_q is kept only after a correction of at most this size
+    GAMMA_SCALE,  # errors of Gamma are relative to this size: largest of all |Gamma_i| and sum_j |G_ij a_j| so far
+    REUSE,  # at stages, the inner loop evaluates C_q again only if its last correction of positions exceeds this
+    ROUNDED,  # rounding error of positions; it replaces the limit REUSE at the ends of steps
     GENERATION,  # number of partitions so far: a change of this number shows that the partition has changed
     RANK,  # rank of C_q, stored only if the workspace was allocated for another rank (code RANK_DIFFERS)
     RANK_V,  # rank of [C_q; A], stored together with RANK
     CONTRADICTION,  # with the code ROWS_CONTRADICT: index of a violated row of [C_q; A]
-    # smallest pivot in the last elimination of C_q, with rows scaled to maxima of 1; fixed-order form: sqrt(SMALLEST)
-    PIVOT,
-    # 1: a singular position was near, or the method never checks for one; 2: one is near, stages are projected; 0: else
+    PIVOT,  # smallest pivot of the last elimination of C_q (rows scaled to maximum 1); fixed-order form: sqrt(SMALLEST)
+    # 0: very short steps trigger a check for a singular position. 1: they do not, because of the method, or because a
+    # singular position has been near. 2 (only in the fixed-order form): one is near now, and stages are projected
     NEARLY_SINGULAR,
-    NEAR_NOW,  # 1: a singular position was near at the last check; 2: the next check chooses a new partition; 0: else
+    NEAR_NOW,  # 1: a singular position was near at the last check; 2: a check with a new partition is needed; 0: else
     MASS_SCALE,  # factor by which M is multiplied in the augmented matrix, see linalg/saddle_point.py
     FACTORED,  # 1: the factors of the equations for accelerations belong to w.M and w.G; 0: M or G has changed since
     HAS_GAMMA,  # 1: the callback `kinematics` has computed w.Rate and w.Gamma[:n_c] at the present state; 0: it has not
@@ -85,13 +85,13 @@ FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN, REACTION_BY_Q_GIVEN, MASS_VALUES_GIVEN = (
     EXPLICIT_STEP,  # 1: with a pair of methods (stiffness.py), the last attempted step was explicit; 0: else
     DEFECT,  # largest defect of accelerations in the attempted step, relative to the allowed defect; -1: not evaluated
     LARGEST_DEFECT,  # largest value of DEFECT in the accepted steps
-    UNCHECKED,  # number of accepted steps without an evaluated defect
+    UNCHECKED,  # number of accepted steps, since the start of the run, whose defect has not been evaluated
     WIDEST_GAP,  # longest time (s) between two evaluations of the equations within accepted steps
     LAST_JUMP,  # time (s) of the last known jump of a constraint rate (C_t, b); -infinite: none
     NEXT_JUMP,  # time (s) of the next known jump of a constraint rate (C_t, b), or end of the run; infinite: unknown
-    # largest |coefficient| of redundant rows as sums of independent rows, at this partition's first check; 0: unknown
+    # largest |coefficient| that expresses redundant rows by independent ones, at this partition's first check; 0: none
     MAX_COEFFICIENT,
-    SMALLEST,  # fixed-order form: smallest sine^2 of an angle between rows of C_q; negative: M is not positive definite
+    SMALLEST,  # fixed-order form: least sin^2 of a row's angle to the span of earlier rows of C_q; -1: M not definite
     TIME_IS_UP,  # 1 (set by another thread): the time limit has passed, and evaluations return STOPPED; 0: not yet
     N_NOTES,
 ) = range(33)
@@ -103,7 +103,7 @@ def _group(first: str, end: str) -> dict[str, int]:
     return {name.lower(): globals()[name] for name in names[names.index(first) : names.index(end)]}
 
 
-# by name of an attribute in kernels, such as w.pivot, w.n_evaluations and f.form: index of the element in its array
+# for each attribute in kernels, such as w.pivot, w.n_evaluations and f.form: index of the array element that it reads
 NOTES, COUNTERS = _group("SENSITIVITY", "N_NOTES"), _group("N_ACCEPTED", "N_COUNTERS")
 FLAGS = _group("CONSTANT_MASS", "FIRST_GIVEN") | {f"{kind}_given": index for kind, index in GIVEN.items()}
 
@@ -124,8 +124,8 @@ WINDOW = 4  # number of accepted states that a polynomial of dense output interp
 (
     SEPARATE,  # one polynomial interpolates q and v, and yields q; another interpolates v and a, and yields v
     VELOCITIES,  # one polynomial interpolates q and v, but not the accelerations a, which contain noise of stiff modes
-    ACCELERATIONS,  # one polynomial interpolates q, v and a
-    ACROSS,  # same as ACCELERATIONS, for a step across a singular position
+    ACCELERATIONS,  # one polynomial interpolates q, v and a in the interval
+    ACROSS,  # one polynomial interpolates q, v and a, across a singular position, or after another method took over
     JUMP,  # no polynomial: velocities jump in the interval, which is only a few spacings of floating-point times long
 ) = range(5)
 # columns of the table of intervals, which has one row for each interval that contains output times

@@ -20,7 +20,7 @@ from twoloop.kernels.linalg.dense import largest_of, ldl_factor
 
 NO_ENTRY = 1e-12  # an entry of C_q counts as zero if it is at most this fraction of the largest entry of its row
 MAX_SWEEPS = 20  # largest number of iterations in `column_units`; each fits the units of rows, then of coordinates
-NEGLIGIBLE = 1e-6  # `linear_ranges` ignores |q_j| if it is at most this fraction of the largest one in the same row
+NEGLIGIBLE = 1e-6  # `linear_ranges` ignores |q_j| up to this fraction of the largest |q_j| of the same row of C_q
 
 
 @exact
@@ -106,9 +106,9 @@ def linear_ranges(coordinates_in_units, radius, negligible, scratch, ranges):
     """Store in `ranges` how far coordinates can move, in their units, before each row of C_q changes much.
 
     Entry (i, j) of `coordinates_in_units` is |q_j| in its unit if row i of C_q has a nonzero entry j, else 0. `radius`:
-    norm of each row / change of the row per unit displacement. If the radius is at most 1, or at most the largest |q_j|
-    of the row, it is the range. If not, the range is the lower median of the |q_j| of the row that exceed NEGLIGIBLE
-    times the largest one; but if no |q_j| of the row exceeds the argument `negligible`, the range is 1.
+    norm of each row / change of the row per unit displacement. Let x be the largest |q_j| of a row. If the radius is
+    at most max(x, 1), it is the range. If the radius is larger, the range is 1 where x <= `negligible`, otherwise the
+    lower median of the |q_j| that exceed NEGLIGIBLE * x.
     """
     for i in range(ranges.size):
         largest, n = 0.0, 0
@@ -127,10 +127,10 @@ def linear_ranges(coordinates_in_units, radius, negligible, scratch, ranges):
 
 
 # flags that `evaluate_start` returns. WELL_FORMED: all values are finite, M is symmetric, no row of C_q or A is zero.
-# CONSISTENT: the state satisfies the constraints up to rounding. Only for a varying M, with L = roundings[2] max|M_ij|:
-# DEFINITE if all eigenvalues of M exceed L * EIGENVALUE_MARGIN; INDEFINITE if one is below L / EIGENVALUE_MARGIN
+# CONSISTENT: the state satisfies the constraints up to rounding. Only a varying M sets DEFINITE (all its eigenvalues
+# exceed L * EIGENVALUE_MARGIN, L = roundings[2] max|M_ij|) or INDEFINITE (one is below L / EIGENVALUE_MARGIN)
 WELL_FORMED, CONSISTENT, DEFINITE, INDEFINITE = 1, 2, 4, 8
-MAX_RELATIVE_DISTANCE = 0.5  # sizes recorded at a position p are used at q if all |q_j - p_j| are at most this * size_j
+MAX_RELATIVE_DISTANCE = 0.5  # recorded sizes of coordinates are used at q if all |q_j - recorded q_j| <= this * size_j
 ROUNDING_OF_ZERO = 2.0**-52  # a coordinate up to this fraction of the largest one may be zero with a rounding error
 EIGENVALUE_MARGIN = 2.0  # if the least eigenvalue of M is within this factor of its limit, a check in Python decides
 
@@ -174,7 +174,7 @@ def _is_symmetric(mass, tolerance):
 def _is_rounding_error(value, row, state, sizes, min_size, rate, tolerance):
     """Return True if `value`, the violation of a constraint, is at most `tolerance` times the sum of its |terms|.
 
-    Terms: `rate`, and row[j] * state[j] for all j, where sizes[j] or `min_size` replaces |state[j]| if it is larger.
+    The |terms| are |rate| (C_t, b, or 0) and, for each j, |row[j]| * max(|state[j]|, sizes[j], min_size).
     """
     sum_of_terms = abs(rate)
     for j in range(state.size):
@@ -205,7 +205,7 @@ def _has_same_entries(rows, entries):
 
 @exact
 def _index_of_near_position(q, rows, n_c, records):
-    """Return the index in `records` (see `evaluate_start`) where the record of a position near q begins; -1: none."""
+    """Return the index in `records` (see `evaluate_start`) of a position near q with nonzeros as in `rows`, or -1."""
     n = q.size
     stride = 2 * n + n_c * n
     for k in range(0, records.size, stride):
@@ -220,9 +220,9 @@ def _index_of_near_position(q, rows, n_c, records):
 def _is_consistent(C, rate, rows, q, v, records, tolerance):
     """Return True if (q, v) satisfies the constraints up to rounding errors; `rows`: [C_q; A], `rate`: C_t and b.
 
-    The violation of a constraint is compared with its terms. In the terms, the size of a coordinate in `records` (see
-    `evaluate_start`), or the rounding error of the largest coordinate, replaces a smaller |q_j|. Otherwise constraints
-    on coordinates that are zero up to rounding, such as those normal to a plane of motion, would seem violated.
+    A violation is compared with the sum of |terms| of the constraint. In a term, |q_j| counts as at least the size of
+    q_j in `records` (see `evaluate_start`), and at least the rounding error of max|q|; |v_j| counts as max|v|. Else a
+    coordinate normal to a plane of motion, zero except for rounding, would seem to violate a constraint.
     """
     fastest, rounding = largest_of(v), ROUNDING_OF_ZERO * largest_of(q)
     begin = _index_of_near_position(q, rows, C.size, records)
@@ -264,7 +264,7 @@ def _is_definite(mass, min_eigenvalue, factors):
 def evaluate_start(f, t, q, v, records, lam, results, mass, rows, shifts, pattern, roundings):
     """Evaluate all callbacks at the start (t, q, v), and store their results; return the sum of the flags that apply.
 
-    The flags are WELL_FORMED, CONSISTENT, DEFINITE and INDEFINITE; 0 if a value is not finite. Arguments:
+    The flags are WELL_FORMED, CONSISTENT, DEFINITE and INDEFINITE. If a value is not finite, return 0. Arguments:
 
     - roundings: relative limits of the violation of constraints, the asymmetry of M, and the eigenvalues of M
     - records: for each of several positions, n_q sizes of coordinates, the position (n_q), and 1 where C_q is nonzero,
@@ -317,7 +317,7 @@ def evaluate_start(f, t, q, v, records, lam, results, mass, rows, shifts, patter
         result_flags = WELL_FORMED
         if _is_consistent(results[force:C], results[C:rate], rows, q, v, records, roundings[0]):
             result_flags |= CONSISTENT
-    if f.constant_mass == 0:  # neither DEFINITE nor INDEFINITE is set if the least eigenvalue is close to its limit
+    if f.constant_mass == 0:  # if the least eigenvalue of M is close to its limit, set neither DEFINITE nor INDEFINITE
         if _is_definite(mass, EIGENVALUE_MARGIN * roundings[2], scratch):
             result_flags |= DEFINITE
         elif not _is_definite(mass, roundings[2] / EIGENVALUE_MARGIN, scratch):

@@ -27,7 +27,7 @@ def constraint_rows(f, w, t, q, G):
 def clear_rows(f, w):
     """Set the constraint Jacobian w.G to zero; in the augmented form, only its nonzero entries, see w.row_entries."""
     if f.form == AUGMENTED:
-        for i in range(w.Rate.size):  # other entries are zero: the task VERIFY_PATTERN detects any that are not
+        for i in range(w.Rate.size):  # entries not in w.row_entries are zero, as the task VERIFY_PATTERN checks
             for k in range(w.row_entries[i], w.row_entries[i + 1]):
                 w.G[i, w.row_entries[k]] = 0.0
     else:
@@ -94,7 +94,7 @@ ONE_SIDED_WEIGHTS, ONE_SIDED_WEIGHTS_COARSE = (-1.5, 2.0, -0.5, 0.0), (-0.75, 0.
 ONE_SIDED_STEP_RATIO = 1.0 / 16.0  # ratio of the time step of one-sided differences to that of central differences
 # assumed rounding error of Gamma, divided by (largest |term G_ij v_j| / largest time step); G: constraint Jacobian
 ROUNDING_OF_TERMS = 1e-14
-CONVERGED_CHANGE = 0.01  # the search for a time step ends if Gamma changes by at most this part of its allowed error
+CONVERGED_CHANGE = 0.01  # time steps are divided until Gamma changes by at most this part of its allowed error
 
 
 @exact
@@ -117,7 +117,7 @@ def largest_difference_step(q, v):
 
 @merged
 def _difference_side(w, t, e):
-    """Return the side of t for differences: 0 (both) or, if C_t or b jumps near t, 1 (after t) or -1 (before t)."""
+    """Return where to take differences: 0 (around t) or, if C_t or b jumps near t, 1 (after t) or -1 (before t)."""
     since_jump, until_jump = t - w.last_jump, w.next_jump - t
     if min(since_jump, until_jump) >= 2.0 * e:
         return 0.0
@@ -171,7 +171,7 @@ def _fill_gamma(f, w, t, q, v, e, first, last):
 
 @merged
 def _max_disagreement(w):
-    """Return the allowed difference of Gamma with the time steps e and 2 e; the error of Gamma is less than this."""
+    """Return the largest allowed |Gamma for the time step e - Gamma for 2 e|; the error of Gamma is smaller."""
     return max(w.gamma_required, ROUNDING_DISAGREEMENT) * w.gamma_scale
 
 
@@ -213,15 +213,15 @@ def gamma_by_differences(f, w, t, q, v, first, last):
     """Store Gamma[first:last] in w.Gamma, by differences; return DONE, or GAMMA_INACCURATE if no time step is accurate.
 
     Gamma = -d/de [G v + (C_t, b)](t + e, q + e v) at e = 0, where v is constant. Errors are relative to w.gamma_scale,
-    the size of Gamma so far. The time step e is w.gamma_step_ratio times `largest_difference_step`. If Gamma with e and
-    Gamma with 2 e differ too much, as with kilohertz drives, a new ratio is chosen.
+    the largest size of Gamma so far. The time step e is w.gamma_step_ratio times `largest_difference_step`. If Gamma
+    with e and Gamma with 2 e differ too much, as with kilohertz drives, a new ratio is chosen.
     """
     largest_step = largest_difference_step(q, v)
     e = representable_step(t, w.gamma_step_ratio * largest_step)
     if e > 0.0:
         largest, disagreement, terms = _fill_gamma(f, w, t, q, v, e, first, last)
         if np.isnan(largest) or disagreement == 0.0 or w.gamma_scale == 0.0:
-            return DONE  # accept NaN (the caller reports it), a zero error, and any error while w.gamma_scale is 0
+            return DONE  # accept NaN (the caller reports it), a zero error, and any error before w.gamma_scale is known
         rounding = ROUNDING_OF_TERMS * terms / largest_step
         w.gamma_scale = max(w.gamma_scale, largest, rounding / w.gamma_required)
         if disagreement < NEGLIGIBLE_DISAGREEMENT * w.gamma_scale:

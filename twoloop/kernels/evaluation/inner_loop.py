@@ -181,7 +181,7 @@ def _find_least_correction(f, w):
 
 @merged
 def _find_corrections(f, w, v):
-    """Correct v, but only store the correction of q, in w.y; return the largest |correction| of q, and that of v."""
+    """Correct v in place, but not q: store the correction of q in w.y. Return max|correction| of q, and of v."""
     rows, n_c = w.rows_v, w.C.size
     row_residual(w, v, rows)
     for i in range(rows.size):
@@ -314,7 +314,7 @@ def evaluate(f, w, t, q, v, tolerance, a):
 
 @merged
 def evaluate_state(f, w, t, q, v, tolerance, a, lam):
-    """Compute a state at the end of a step: dependent entries of q and v up to rounding, `a` and lam; return a code."""
+    """At the end of a step, compute dependent entries of q and v up to rounding; store `a` and lam; return a code."""
     return f.inner(f, w, tasks.EVALUATE_STATE, t, q, v, tolerance, a, lam)
 
 
@@ -389,7 +389,7 @@ def rounding_floor(q):
 
 @kernel(INNER)
 def generated_inner_loop(f, w, task, t, q, v, theta, a, lam):
-    """Do a task by generated code or, if this is missing or fails, by `f.general`, for any mechanism; return a code."""
+    """Do a task by generated code, or by `f.general` if the code is missing or fails; return DONE or a failure code."""
     if task == tasks.EVALUATE_WITHOUT_PROJECTION:
         w.n_evaluations += 1
         w.n_factorizations += 1
@@ -421,6 +421,6 @@ def generated_inner_loop(f, w, task, t, q, v, theta, a, lam):
         if f.own_redundant(t, q, v, f.numbers, a):
             return DONE
         f.general(f, w, tasks.FIND_NULL_SPACE, t, q, v, theta, a, lam)  # stores the Jacobian, for the check below, in w
-    elif task <= tasks.MULTIPLIERS:  # these tasks use a partition: there is no generated code for them
+    elif task <= tasks.MULTIPLIERS:  # generated code cannot do these tasks, because they use a partition
         w.used_general = 1.0
     return f.general(f, w, task, t, q, v, theta, a, lam)

@@ -11,16 +11,16 @@ import math
 from twoloop.kernels.data.common import compiled, exact
 
 # kinds of operations. SUM is a sum of terms; RESULT is a sum of terms that is an output of the program. PENDING is a
-# product x y in a Taylor series; the coefficient of order k of y is an unknown of linear equations for the order k
+# product x y of Taylor series without one term: coefficient k of the product omits the unknown coefficient k of y
 PRODUCT, RECIPROCAL, SQUARE_ROOT, EXPONENTIAL, SINE, COSINE, LOGARITHM, ARCTANGENT, PENDING, SUM, RESULT = range(11)
 # columns of the table of a program, which has one row for each operation. `nodes` are the numbers that the program
 # reads and computes. Each argument of an operation is a constant plus terms; a term is a coefficient times a node.
 # - KIND: kind of the operation, such as SINE; NODE: index of the operation's result in `nodes`
 # - FIRST, SECOND, END: terms FIRST to SECOND - 1 of the list of terms make argument 1, SECOND to END - 1 argument 2
 KIND, NODE, FIRST, SECOND, END, N_COLUMNS = range(6)
-# A program is a vector of integers. It begins with the numbers of nodes, rows, terms and results, at the indices below.
-# Then follow the rows of the table; for each term, the index of the node that it multiplies; and for each result, the
-# index of the result in w.Gamma or in the flattened C_q. The results are the last nodes
+# A program is a vector of integers. It begins with the numbers of nodes, operations, terms and results, at the indices
+# below. Three lists follow: for each operation, the numbers KIND to END; for each term, the index of the node that
+# it multiplies; for each result, its index in w.Gamma or in the flattened C_q. The results are the last nodes
 N_NODES, N_ROWS, N_TERMS, N_RESULTS, N_SIZES = range(5)
 
 
@@ -59,11 +59,11 @@ def affine_sum(nodes, table, columns, numbers, coefficients, constant, begin, en
 
 @exact
 def run_table(table, rows, n_rows, columns, numbers, coefficients, constants, nodes, inputs, t, q, v):
-    """Do the operations of a program: store t, q, v in `nodes` from index `inputs` on, then the results of operations.
+    """Do the operations of a program; store t, q, v (from index `inputs` on) and the results of operations in `nodes`.
 
-    The vector `table` (integers, or floats without a fraction) contains a row for each operation, from index `rows` on,
-    and for each term the index of the node that it multiplies, from index `columns` on. The vector `numbers` contains
-    coefficients of terms from index `coefficients` on, and two constants for each row from index `constants` on.
+    The vector `table` (integers, or floats without a fraction) contains a row for each operation; the first row begins
+    at index `rows`. From index `columns` on, `table` contains the index of each term's node. The vector `numbers`
+    contains the terms' coefficients from index `coefficients` on, and two constants per row from `constants` on.
     """
     nodes[inputs] = t
     for j in range(q.size):
@@ -87,7 +87,7 @@ def _run_program(program, numbers, nodes, t, q, v):
 
 @exact
 def _result_indices(program):
-    """Return the number of results, the index of the first in `nodes`, and where `program` lists output indices."""
+    """Return n, the first index of n results in w.nodes, and where `program` lists their indices in the output."""
     n = program[N_RESULTS]
     return n, program[N_NODES] - n, N_SIZES + N_COLUMNS * program[N_ROWS] + program[N_TERMS]
 

@@ -39,7 +39,7 @@ from twoloop.kernels.linalg.markowitz_lu import (
 LARGE_COLUMN = 16.0  # columns of the constraint Jacobian with larger entries are scaled when pivots are chosen
 RANK_TOLERANCE = 1e-11  # a pivot, or the ratio of the smallest to the largest pivot, counts as zero up to this limit
 PARTITION_CHANGED = -1  # return code: the task succeeded, as for DONE, and the partition has changed
-MAX_ROWS_ELIMINATED = 200  # with more independent rows than this, `min_pivot_ratio` returns the last pivot to save time
+MAX_ROWS_ELIMINATED = 200  # with more independent rows than this, `min_pivot_ratio` returns w.pivot to save time
 # a partition is poor if the sensitivity of dependent to independent coordinates exceeds its first value by this factor
 SENSITIVITY_GROWTH = 3.0
 
@@ -173,7 +173,7 @@ def _find_pivot_order(w, max_rank, max_rank_v):
     w.pivot = abs(G[rank - 1, rank - 1]) if rank > 0 else 1.0
     if n_rows == n_c:
         return rank, rank
-    last = rank  # pivots are chosen in the first `last` rows: the loop puts rows of A after the independent rows
+    last = rank  # pivots are chosen in rows before `last`: the loop puts rows of A after the independent rows of C_q
     for i in range(n_c, n_rows):
         row_order[last], row_order[i] = row_order[i], row_order[last]
         for j in range(G.shape[1]):
@@ -184,7 +184,7 @@ def _find_pivot_order(w, max_rank, max_rank_v):
 
 @compiled
 def smallest_pivot(f, w, t, q):
-    """Return the smallest pivot of C_q at (t, q), rows scaled to maxima 1; 0 if the rank is below the partition's."""
+    """Return the smallest pivot of C_q at (t, q), with rows scaled to maxima of 1; 0 if C_q has lost rank."""
     rank = w.rows.size
     if rank == 0:
         return 1.0
@@ -245,7 +245,7 @@ def write_programs(w):
 
 @compiled
 def _record_columns_of_entries(w):
-    """Store the columns of ones in row i of w.pattern as w.row_entries[w.row_entries[i] : w.row_entries[i + 1]]."""
+    """Store the columns of ones in w.pattern, row by row, in w.row_entries; row i begins at index w.row_entries[i]."""
     n_rows = w.Rate.size
     index = n_rows + 1
     for i in range(n_rows):
@@ -363,11 +363,11 @@ def _largest_coefficient(w):
 
 @compiled
 def partition_is_poor(w):
-    """Return True if the dependent coordinates have become so sensitive that a new partition is needed.
+    """Return True if the dependent coordinates are so sensitive to the independent ones that a new partition is needed.
 
-    The sensitivity to the independent coordinates is max|C_qd^-1 C_qi| (w.D); C_qd and C_qi are the columns of the
-    dependent and the independent coordinates in C_q. The sensitivity is near 1 after full pivoting, and grows without
-    bound where the independent coordinates stop being valid. Also return True if the independent rows become dependent
+    The sensitivity is max|C_qd^-1 C_qi| (w.D); C_qd and C_qi are the columns of the dependent and the independent
+    coordinates in C_q. It is near 1 after full pivoting, and grows without bound where the independent coordinates no
+    longer determine the dependent ones. Also return True if the independent rows become dependent
     while the rank stays the same: redundant rows then have large coefficients as combinations of independent rows.
     """
     largest = 0.0
@@ -460,7 +460,7 @@ def restore_positions(f, w, t, q, v, tolerance, reuse_limit):
     """Solve C(t, q) = 0, eq. (15) of the paper, by Newton's method for the dependent positions in q; return a code.
 
     The iteration ends after a correction of at most `tolerance`. If this correction was larger than `reuse_limit`, the
-    Jacobian is evaluated and factored again at the final q; otherwise w keeps the Jacobian before the correction.
+    Jacobian is evaluated and factored again at the final q; otherwise w keeps the Jacobian from before this correction.
     The callback `kinematics`, if the user gave one, evaluates C, C_q and gamma (w.Gamma) together.
     """
     last_correction = np.inf
@@ -551,7 +551,7 @@ def restore_velocities(f, w, t, q, v, reuse_limit):
 
 @compiled
 def check_all_rows(f, w, t, q, v):
-    """Return DONE if the accepted state (q, v) satisfies all constraints, including redundant ones.
+    """Return DONE if the accepted state (q, v) satisfies all constraints, also redundant ones, else ROWS_CONTRADICT.
 
     If a constraint is violated by more than MAX_VIOLATION, store its index in w.contradiction; return ROWS_CONTRADICT.
     On entry, w.G must contain the Jacobian of all constraints at this state, and w.Rate the rates (C_t, b).

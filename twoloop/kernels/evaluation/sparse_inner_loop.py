@@ -66,7 +66,7 @@ from twoloop.kernels.linalg.symbolic_factorization import (
 )
 
 # in the metric of M^-1, pivot / (squared norm of a row of C_q) is sin^2 of the row's angle to the span of previous rows
-SUSPECT_PIVOT = 1e-6  # up to this squared sine of a row's angle, a pivot may be a rounding error: the row is checked
+SUSPECT_PIVOT = 1e-6  # a pivot up to this * (squared norm of its row) may be a rounding error: the row is checked
 MIN_PIVOT = 1e-10  # factors are accurate if pivot / (squared norm of the row) exceeds this for all independent rows
 MAX_DEPENDENT_SINE = 1e-11  # a row is redundant if the sine of its angle to the independent rows' span is at most this
 PROJECT_STAGES = 2.0  # value of w.nearly_singular with which stages are projected before they are evaluated
@@ -170,7 +170,7 @@ def solve_unknowns(f, w, n_corrections):
 
 @compiled
 def n_refinements(w):
-    """Return how many steps of iterative refinement (0, 1 or 2) solutions with the factors in w need."""
+    """Return the number of iterative refinements (0, 1 or 2) that solutions with the factors in w need."""
     smallest = w.smallest
     return 0 if smallest > REFINE_ONCE_BELOW else 1 if smallest > REFINE_TWICE_BELOW else 2
 
@@ -189,7 +189,7 @@ def _sine_to_independent_rows(f, w, row, square):
             x[columns[k]] += w.jacobian_values[k]
     solve_unknowns(f, w, 2)
     rows, columns, _ = mass_entries_of(f.ldl_program)
-    for k in range(rows.size):  # part = x^T M x: squared norm of the row's component orthogonal to independent rows
+    for k in range(rows.size):  # with the solution x, x^T M x is |component of row g orthogonal to independent rows|^2
         part += x[rows[k]] * w.mass_values[k] * x[columns[k]]
     return np.sqrt(part / square) if square > 0.0 else 0.0
 
@@ -213,7 +213,7 @@ def _choose_rows(f, w, t, q):
     if not _factor_entries(f, w, SUSPECT_PIVOT) > 0.0:
         return _failure_of_factorization(w, t, q)
     order, n_q = pivot_order_of(f.ldl_program), w.Q.size
-    copy(w.is_independent, w.z)  # w.z (scratch): 0 for rows with small pivots, which are checked below
+    copy(w.is_independent, w.z)  # w.z (scratch) marks rows with small pivots by 0; the loop below checks these rows
     for k in range(order.size):
         row = order[k] - n_q
         if row < 0 or w.z[row] != 0.0:
@@ -231,7 +231,7 @@ def _choose_rows(f, w, t, q):
 
 @compiled
 def _adopt_rows(w):
-    """Store the indices of the independent rows in w.rows_v; return DONE, or SINGULAR if the number of rows changes."""
+    """Store the indices of the independent rows in w.rows_v; return DONE, or SINGULAR if w.rows_v has another size."""
     if _count_independent(w.is_independent) != w.rows_v.size:
         return SINGULAR
     position = 0
@@ -263,7 +263,7 @@ def choose_rows(f, w, t, q):
 # sum of squares of column j of C_q
 REGULARIZATION = 1e-11
 CONVERGED_RESIDUAL = 1e-14  # multipliers are refined until (error of reactions) / (largest reaction) is at most this
-MAX_RESIDUAL = 1e-9  # if refinements help no more, (error of reactions) / (largest reaction) may be up to this
+MAX_RESIDUAL = 1e-9  # multipliers are rejected if (error of reactions) / (largest reaction) stays above this
 MAX_SOLUTIONS = 30  # largest number of refinements of the multipliers of least norm
 
 
@@ -293,7 +293,7 @@ def _fill_least_norm_matrix(program, jacobian, n_q, weights, values):
 
 @compiled
 def _fill_residual(program, jacobian, force, x, r):
-    """Store in r the residual of the equations for the multipliers of least norm; return its relative size.
+    """Store in r the residual of the equations that yield the multipliers of least norm; return its relative size.
 
     See the module docstring: the residual is [p - G^T lam, lam - G y], its relative size max|p - G^T lam| / max|p|.
     x: approximate solution [y, lam]. p (`force`): reactions that lam must have. `jacobian`: entries of C_q = G.
@@ -506,7 +506,7 @@ def _check_redundant_rows(f, w, t, q, v):
 
 @compiled
 def _do_task_between_evaluations(f, w, task, t, q, v, a, lam):
-    """Do a task that neither evaluates nor projects; return a code: NEEDS_DENSE if only dense forms have this task."""
+    """Do a task from FIND_NULL_SPACE to SOLVE (tasks.py); return a code, NEEDS_DENSE if the task needs a dense form."""
     if task == tasks.FIND_NULL_SPACE:
         return factor_equations_at(f, w, t, q)
     if task == tasks.RENEW_PARTITION:

@@ -98,7 +98,7 @@ def _write_final_states(work, control, n, n_rows, new, a, last, out_q, out_v, ou
 
 @compiled
 def _count_evaluations(settings, work, n_evaluations):
-    """Add the number of evaluations in the last step of each lane to n_evaluations[index of the run in the lane]."""
+    """For each run in a lane, add the number of evaluations in its last step to its entry of n_evaluations (n_runs)."""
     for k in range(LANES):
         if work[at.RUNNING * LANES + k] == 1.0:
             n_within = settings[at.N_EVALUATIONS] + int(work[at.EVALUATED * LANES + k])

@@ -121,7 +121,7 @@ def choose_steps(work, control, status, n_steps):
 
 @compiled
 def set_end(work, control):
-    """Set T_NEW, the time of the new state, to T + X or, at the end of the run, exactly to t1 (no rounding error)."""
+    """Set T_NEW, the time X seconds after the step began at T, to T + X, or exactly to t1 if the run ends then."""
     for k in range(LANES):
         t, x = work[at.T * LANES + k], work[at.X * LANES + k]
         work[at.T_NEW * LANES + k] = control[at.T1] if x == control[at.T1] - t else t + x
@@ -129,7 +129,7 @@ def set_end(work, control):
 
 @compiled
 def end_steps(code, settings, control, work, predicted_v):
-    """Project NEW, the state at the end of the step, onto the constraints; include this change in the estimate ERROR.
+    """Project NEW, the state at the end of the step, onto the constraints; the change of NEW may increase ERROR.
 
     Changes by the projection show two errors: the largest change of a velocity, in tolerances, and PREDICTION_ERROR,
     which measures the change of positions. ERROR becomes the largest of these and the method's error estimate. So a
@@ -210,7 +210,7 @@ def memory_size(s: int, n: int) -> int:
 def step_by_dop853(code, settings, control, options, work, status, n_steps, within):
     """Take a step of DOP853 in each lane, at most as long as control[GAP] (s).
 
-    If `within`, take no step: compute the states at the time X (s) after the beginning of the last accepted step.
+    If `within`, take no step: compute the states X seconds after the beginning of the last accepted step.
     """
     n = settings[at.N]
     state, _, _, _, a, _, _, memory = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])
@@ -231,7 +231,7 @@ def step_by_dop853(code, settings, control, options, work, status, n_steps, with
 def step_by_series(code, settings, control, options, work, status, n_steps, within):
     """Take a step in each lane, by the Taylor series about the beginning of the step.
 
-    If `within`, take no step: compute the states at the time X (s) after the beginning of the last accepted step.
+    If `within`, take no step: compute the states X seconds after the beginning of the last accepted step.
     """
     order = settings[at.ORDER]
     if within:
@@ -245,7 +245,7 @@ def step_by_series(code, settings, control, options, work, status, n_steps, with
     code.compute_series(order, control, work)
     code.choose_sizes(order, control, work)
     _round_steps(work, control)
-    for k in range(LANES):  # store X, the step size in units of UNIT, and the number of evaluations added in long steps
+    for k in range(LANES):  # X is step size / UNIT. Steps longer than GAP (s) require EVALUATED evaluations within them
         work[at.X * LANES + k] = work[at.H * LANES + k] / work[at.UNIT * LANES + k]
         if work[at.ACTIVE * LANES + k] == 1.0 and work[at.H * LANES + k] > control[at.GAP]:
             work[at.EVALUATED * LANES + k] = np.ceil(work[at.H * LANES + k] / control[at.GAP]) - 1.0

@@ -42,7 +42,7 @@ LANES = 8 if has_wide_vectors() else 4  # number of runs at once: the number of 
     PREDICTION_ERROR,  # (difference of predicted and projected positions) / (allowed difference), see step_size.py
     LENGTH,  # step size that the last terms of a Taylor series allow, in units of UNIT
     LONGEST,  # upper limit of the next step size (s), which Taylor methods compute after each step
-    REQUESTED,  # 1 in lanes that begin a run, or whose state at an output time within the step is computed
+    REQUESTED,  # 1 in lanes whose start, or whose state at an output time within the step, is being projected
     WORST_DEFECT,  # largest defect within the step, relative to the allowed defect
     N_REJECTED,  # number of successive rejected steps
     RUNNING,  # 1 in lanes with a run
@@ -58,10 +58,10 @@ LANES = 8 if has_wide_vectors() else 4  # number of runs at once: the number of 
     H_LIMIT,  # upper limit of step sizes (s), set by a failed step; infinity: no limit
     LIMIT_AGE,  # number of accepted steps since H_LIMIT was set
     JUMP_END,  # time (s) at the end of the last step that was rejected with an error above SUDDEN_ERROR
-    SHIFT,  # number from 0 to 1 that shifts the times of evaluations of the defect within a step
+    SHIFT,  # from 0 to 1; times at which the defect within a step is evaluated are shifted in proportion to 2 SHIFT - 1
     EVALUATED,  # number of evaluations within the step, in addition to settings[N_EVALUATIONS]
     DISPLACED,  # typical size of q (or v): finite differences displace smaller components as if they had this size
-    LARGEST,  # largest |component| of q (or v), which finite differences displace
+    LARGEST,  # largest |component| of the vector, q or v, that finite differences displace
     PAST,  # size and error of the last accepted step, for step-size control: both of lane 0, then both of lane 1, ...
     _MORE_PAST,
     N_FIELDS,
@@ -173,7 +173,7 @@ def copy_vectors(work, source, target, count):
 
 @merged
 def _add_product_in_four_lanes(work, t, p, q, sign):
-    """Add sign * work[p] * work[q] to work[t], also in the next three lanes. For SIMD, all reads precede the writes."""
+    """In one lane and the next three, add sign * work[p] * work[q] to work[t]. For SIMD, reads precede all writes."""
     t0, t1 = work[t] + sign * work[p] * work[q], work[t + 1] + sign * work[p + 1] * work[q + 1]
     t2, t3 = work[t + 2] + sign * work[p + 2] * work[q + 2], work[t + 3] + sign * work[p + 3] * work[q + 3]
     work[t], work[t + 1], work[t + 2], work[t + 3] = t0, t1, t2, t3
@@ -188,14 +188,14 @@ def add_product(work, target, x, y, sign):
 
 @merged
 def _raised_value(work, target, error, factor, before, after, atol, rtol):
-    """Return max(work[target], ratio) in one lane; see `raise_to_ratio`, whose offsets are indices in `work` here."""
+    """Return the larger of work[target] and |work[error]| * work[factor] / (allowed error), see `raise_to_ratio`."""
     allowed_error = atol + rtol * max(abs(work[before]), abs(work[after]))
     return max(work[target], abs(work[error]) * work[factor] / allowed_error)
 
 
 @compiled
 def raise_to_ratio(work, target, error, factor, before, after, atol, rtol):
-    """In each lane, raise the number at `target` to the ratio of an error to its tolerance, if the ratio is larger.
+    """In each lane, store at `target` the ratio of an error to its tolerance, unless the number there is larger.
 
     The ratio is |error| * factor / (atol + rtol * max(|before|, |after|)); all names but atol and rtol are offsets.
     """
@@ -255,8 +255,7 @@ def _pivot_magnitude(work, entry, imaginary, k):
 def _choose_pivot(work, matrix, pivots, n, imaginary, c):
     """In each lane, find the pivot (largest entry of column c from row c on), exchange rows, and invert the pivot.
 
-    The pivot's row is exchanged with row c, and its index stored in `pivots`. If the pivot is zero, set ACTIVE to 0. If
-    `imaginary` > 0, entries are complex, with imaginary parts `imaginary` vectors after the real parts.
+    Row c is exchanged with the pivot's row, whose index is stored in `pivots`. If the pivot is 0, set ACTIVE to 0.
     """
     for k in range(LANES):
         best, largest = c, _pivot_magnitude(work, matrix + c * n + c, imaginary, k)

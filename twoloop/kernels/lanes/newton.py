@@ -53,7 +53,7 @@ from twoloop.kernels.steps.velocity_errors import LONGEST_GAPS, SLOW_FACTOR, STE
     LARGEST_Q,  # largest correction of a stage's position by this iteration, divided by the square of the step size
     LARGEST_V,  # largest correction of a stage's velocity by this iteration, divided by the step size
     H_PREVIOUS,  # size (s) of the step whose accelerations are in PREVIOUS; 0: there is no such step
-    CONSTANT,  # 1: the predicted accelerations of all stages equal the accelerations at the beginning; else 0
+    CONSTANT,  # 1: the predicted accelerations of all stages equal those at the beginning of the step; else 0
     DURATION,  # time (s) until a velocity error changes its sign or decays, see velocity_errors.py; 0: not known
     N_SINGLE_VECTORS,
 ) = range(11)
@@ -63,7 +63,7 @@ from twoloop.kernels.steps.velocity_errors import LONGEST_GAPS, SLOW_FACTOR, STE
     BEGIN_Q,  # q at the beginning of this step; the next two blocks contain v and a there
     BEGIN_V,
     BEGIN_A,
-    SUMS,  # scratch
+    SUMS,  # scratch, mostly for sums over stages, such as sum_k A_jk a_k
     MIDDLE_Q,  # q in the middle of the step; the next two blocks contain v and a there
     MIDDLE_V,
     MIDDLE_A,
@@ -85,20 +85,20 @@ DERIVATIVE_Q, DERIVATIVE_V, SYSTEMS = range(3)
 
 
 def memory_size(s: int, n: int) -> int:
-    """Return the length of the method's memory, in vectors, for s stages and n coordinates."""
+    """Return the length of the method's memory for s stages and n coordinates, in vectors with one number per lane."""
     n_systems = (s + 1) // 2  # one linear system for each real eigenvalue and each complex pair of the tableau's matrix
     return N_SINGLE_VECTORS + (N_VECTORS + N_BLOCKS * s + n_systems) * n + s * s + (SYSTEMS + 2 * n_systems) * n * n
 
 
 @merged
 def vector_offset(memory, n, block):
-    """Return the offset of a block of n vectors, such as START; `memory`: offset of the method's memory."""
+    """Return the offset of `block`, such as START: n vectors (one number per lane) in memory at offset `memory`."""
     return memory + N_SINGLE_VECTORS + block * n
 
 
 @merged
 def block_offset(memory, n, s, block):
-    """Return the offset of a block of (s, n) vectors, such as STAGES; `memory`: offset of the method's memory."""
+    """Return the offset of `block`, such as STAGES: s * n vectors (a number per lane) in memory at offset `memory`."""
     return memory + N_SINGLE_VECTORS + (N_VECTORS + block * s) * n
 
 
@@ -220,7 +220,7 @@ def predict_stages(settings, c, work, begins):
 
     PREVIOUS belongs to the last accepted step. If the new step size X exceeds MAX_STEP_RATIO times the size of that
     step, the polynomial would be extrapolated too far: then all predictions are the accelerations where the new step
-    begins. `begins`: 1 if the new step follows the accepted step, 0 if it is the first part of the accepted step.
+    begins. `begins`: 1 if the new step begins at the end of the accepted step, 0 if at the beginning of that step.
     """
     n = settings[at.N]
     memory = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])[7]
@@ -252,7 +252,7 @@ def predict_stages(settings, c, work, begins):
 
 @compiled
 def _compute_residuals(code, settings, control, A, A2, c, work):
-    """Store RESIDUAL = F - STAGES (F: accelerations by the equations), SCALE_Q, SCALE_V; on failure, ACTIVE = 0."""
+    """Store RESIDUAL (accelerations by the equations, minus STAGES), SCALE_Q, SCALE_V; set ACTIVE to 0 on failure."""
     n, order = settings[at.N], settings[at.ORDER]
     _, new, _, _, a, _, _, memory = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])
     s = c.size
@@ -317,7 +317,7 @@ def _correct_stages(settings, method_options, s, work):
 
 @merged
 def _raise_to_largest_value(work, target, begin, n):
-    """In each lane, raise the number at `target` to the largest |value|, or a NaN, in the n vectors at `begin`."""
+    """In each lane, raise the number at `target` to max|value| of the n vectors at `begin`; NaN if a value is NaN."""
     for i in range(n * LANES):
         magnitude, index = abs(work[begin * LANES + i]), target * LANES + i % LANES
         if magnitude > work[index] or magnitude != magnitude:
@@ -326,7 +326,7 @@ def _raise_to_largest_value(work, target, begin, n):
 
 @compiled
 def _store_largest_corrections(settings, A, A2, work):
-    """Store in LARGEST_Q, LARGEST_V the largest changes of q and v by CHANGES, divided by X^2 and X (X: step size)."""
+    """From CHANGES, store max|change of q| / X^2 in LARGEST_Q, max|change of v| / X in LARGEST_V (X: step size)."""
     n = settings[at.N]
     memory = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])[7]
     s = A.shape[0]
@@ -397,7 +397,7 @@ def solve_stages(code, settings, control, options, method_options, A, A2, c, wor
 
 @compiled
 def store_state_from_stages(settings, b, bA, work):
-    """Store in NEW the state at the time X (s) after the step begins; STAGES have weights b for v, bA = b A for q."""
+    """Store in NEW the state X seconds after the step's start: sum STAGES with the weights b for v, bA = b A for q."""
     n = settings[at.N]
     _, new, _, _, _, _, _, memory = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])
     s = b.size
@@ -433,7 +433,7 @@ def _store_embedded_estimate(settings, method_options, A, work, memory):
         total += e[i]
     for i in range(n * LANES):
         work[e_q * LANES + i] = (gamma0 + total) * work[begin * LANES + i]
-    for j in range(s):  # add e_j, the weight of stage j, times H sum_k A_jk a_k, the change of v until the stage
+    for j in range(s):  # add to E_Q the change of v until stage j, H sum_k A_jk a_k, with the weight e_j
         sum_rows(A[j], stage_rows, vector_range(work, sums, n))
         for i in range(n * LANES):
             work[e_q * LANES + i] += e[j] * work[at.H * LANES + i % LANES] * work[sums * LANES + i]
@@ -486,7 +486,7 @@ def _filtered_velocity_error(control, work, n, memory, z, state, new, k):
         largest_a = max(largest_a, abs(work[(begin + n + j) * LANES + k]))
         largest_error = max(largest_error, abs(work[(twice + j) * LANES + k]))
         difference = work[(twice + j) * LANES + k] - 2.0 * work[(once + j) * LANES + k] + work[(raw + j) * LANES + k]
-        largest_difference = max(largest_difference, abs(difference))  # max|(z J)^2 E_V|, see `_filter_errors`
+        largest_difference = max(largest_difference, abs(difference))  # max|(z J)^2 E_V| (z, J: see `_filter_errors`)
     if largest_error > 0.0:
         work[(memory + DURATION) * LANES + k] = z * np.sqrt(largest_error / largest_difference)
     duration = work[(memory + DURATION) * LANES + k]
@@ -520,7 +520,7 @@ def _motion_time(control, work, n, memory, k):
 
 @compiled
 def _add_error_in_slow_directions(settings, control, method_options, s, work):
-    """Raise ERROR to the error that the slowly changing part of E_V causes, if it is larger; see velocity_errors.py."""
+    """If the slowly changing part of the velocity error E_V causes an error larger than ERROR, set ERROR to it."""
     n = settings[at.N]
     state, new, _, _, _, _, _, memory = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])
     e_v, error_field, fine_copy = vector_offset(memory, n, E_V), memory + LARGEST_V, memory + ITERATING
@@ -596,9 +596,9 @@ def _store_stages(work, memory, n, s):
 
 @kernel(STEP, vectorized=True)
 def step_by_newton(code, settings, control, options, work, status, n_steps, within):
-    """Take a step of an implicit Runge-Kutta method in each lane; its largest size is control[GAP] (s).
+    """Take a step of an implicit Runge-Kutta method in each lane, at most as long as control[GAP] (s).
 
-    If `within`, take no step: compute the states at the time X (s) after the beginning of the last accepted step.
+    If `within`, take no step: compute the states X seconds after the beginning of the last accepted step.
     """
     n = settings[at.N]
     state, _, _, _, a, _, _, memory = offsets_in_work(n, settings[at.N_ROWS], settings[at.N_NUMBERS])

@@ -6,7 +6,7 @@ of Z, an eigenvector of G G^T, contains the coefficients of a combination of row
 right-hand sides along the rows of Z are removed, and Z^T Z is added to G G^T, so that the sum is not singular.
 
 `pattern` is the sparsity pattern of G. Its first n_rows + 1 entries are indices in `pattern`: the columns of row i are
-the entries from pattern[i] to pattern[i + 1] - 1. Matrices and vectors in `work` are given by offsets, in vectors.
+pattern[pattern[i]:pattern[i + 1]]. An array in `work` is given by its offset, counted in vectors (one number per lane).
 
 Two further kernels check the results of runs in lanes: they evaluate the callbacks, and store residuals.
 """
@@ -23,7 +23,7 @@ DIAGONAL_SHIFT = 1e-15  # added to the diagonal of G G^T, which may be singular 
 ITERATION_SHIFT = 1e-8  # added to the diagonal of a singular G G^T, to find redundant constraints by inverse iterations
 MAX_REDUNDANT_EIGENVALUE = 1e-4  # up to this eigenvalue, an eigenvector of G G^T counts as a redundant constraint
 N_REDUNDANT_ITERATIONS = 5  # number of inverse iterations per redundant constraint; few suffice for tiny eigenvalues
-GOLDEN_SECTION = 0.6180339887498949  # inverse iterations begin with multiples of this, modulo 1: irregular numbers
+GOLDEN_SECTION = 0.6180339887498949  # inverse iterations begin with irregular numbers: multiples of this, modulo 1
 
 
 @merged
@@ -53,9 +53,9 @@ def subtract_products(work, target, x, x_stride, y, y_stride, count):
 
 @merged
 def subtract_row_product(work, target, entries, pattern, i, y):
-    """In each lane, subtract the dot product of row i of a sparse matrix and the vector at offset y from `target`.
+    """In each lane, subtract from the number `target` the product of row i of a sparse matrix and a vector y.
 
-    `entries`: offset of the nonzero entries, row by row; pattern[pattern[i]:pattern[i + 1]] are the columns of row i.
+    Offsets: `target`, `y`, `entries` (nonzero, row by row). Row i has the columns pattern[pattern[i]:pattern[i + 1]].
     """
     for e in range(pattern[i], pattern[i + 1]):
         subtract_products(work, target, entries + e - pattern[0], 1, y + pattern[e], 1, 1)
@@ -128,7 +128,7 @@ def factor_gram(work, pattern, moves, n_rows, n_redundant, G, row, factors):
 
 @compiled
 def _find_redundant_combinations(work, pattern, n_rows, n_redundant, row, factors):
-    """Store Z in `factors`: eigenvectors of G G^T for the n_redundant least eigenvalues; NaN if these are too large."""
+    """Store Z, eigenvectors of the least eigenvalues of G G^T; NaN for eigenvalues above MAX_REDUNDANT_EIGENVALUE."""
     gram = factors + pattern[n_rows] - pattern[0] + n_rows
     Z = gram + n_rows * n_rows
     scratch = Z + n_redundant * n_rows
@@ -143,7 +143,7 @@ def _find_redundant_combinations(work, pattern, n_rows, n_redundant, row, factor
             _remove_redundant_components(work, n_rows, w, Z, z, scratch)
         normalise_vector(work, z, n_rows, scratch)
         for k in range(LANES):
-            # the vector `scratch` now contains the eigenvalue of G G^T plus ITERATION_SHIFT
+            # the vector `scratch` now contains the eigenvalue of G G^T that belongs to z, plus ITERATION_SHIFT
             if not work[scratch * LANES + k] < MAX_REDUNDANT_EIGENVALUE:
                 work[z * LANES + k] = np.nan
 
@@ -187,7 +187,7 @@ def _solve_with_gram(work, n_rows, factor, x):
 def solve_along_rows(work, pattern, n, n_rows, n_redundant, factors, x, out):
     """Solve G G^T y = x; store -G^T y, the shortest d with G d = -x, in `out` (n); then replace x (n_rows) by y.
 
-    G: Jacobian with rows scaled to norm 1. First, remove from x its components along vanishing combinations of rows.
+    G: Jacobian, rows of norm 1. Components of x along vanishing combinations of rows are removed before solving.
     """
     gram = factors + pattern[n_rows] - pattern[0] + n_rows
     Z = gram + n_rows * n_rows
@@ -211,7 +211,7 @@ def solve_least_change(work, pattern, n, n_rows, n_redundant, factors, x, change
 MAX_ITERATIONS = 12  # largest number of steps of the Gauss-Newton iteration
 ROUNDING_FACTOR = 64.0  # a constraint holds if its residual is at most this number of rounding errors of its terms
 # displaced positions are projected. Another assembly counts as near if a projection differs from the linear prediction
-# (the displacement without its part normal to the constraints) by more than this part of the displacement
+# (the displacement without its component normal to the constraints) by more than this fraction of the displacement
 MAX_CURVATURE = 0.25
 MIN_EIGENVALUE = 1e-12  # constraints are independent if all eigenvalues of G G^T exceed this (rows of G have norm 1)
 N_WEAKEST_ITERATIONS = 10  # number of inverse iterations for the direction that the constraints determine least
@@ -265,11 +265,12 @@ _memory_offsets = merged(offsets_in_memory)
 
 @merged
 def _largest_value(work, offset, count, k):
-    """Return the largest |value| in lane k of the `count` vectors that begin at `offset`, or NaN if a value is NaN."""
+    """Return the largest |value| in lane k of `count` vectors from `offset` on, or NaN if a value is NaN."""
     largest = 0.0
     for j in range(count):
         magnitude = abs(work[(offset + j) * LANES + k])
-        largest = largest if magnitude <= largest else magnitude  # NaN remains NaN
+        if magnitude > largest or np.isnan(magnitude):
+            largest = magnitude
     return largest
 
 
@@ -310,7 +311,7 @@ def _gauss_newton(code, settings, control, pattern, moves, work):
                 continue
             for j in range(n):
                 work[(new + j) * LANES + k] += work[(change + j) * LANES + k]
-            # C is older than this change: if C is a rounding error, the lane has converged, and the change improves q
+            # C was computed before `change` was added. If C was only a rounding error, the lane has converged
             if _constraints_hold(work, pattern, n, n_rows, memory, G, new, k):
                 work[at.UNCONVERGED * LANES + k] = 0.0
             else:
@@ -332,7 +333,7 @@ def _project_velocities(code, settings, control, pattern, moves, work):
     fill_field(work, at.ACTIVE, 1.0)
     code.compute_rows(0, control, work)
     factor_gram(work, pattern, moves, n_rows, n_redundant, G, row, factors)
-    for _ in range(2):  # the second pass removes the rounding errors of a large change
+    for _ in range(2):  # the second correction of v removes rounding errors that a large first correction left
         for i in range(n_rows):
             fill_field(work, x + i, 0.0)
             subtract_row_product(work, x + i, G, pattern, i, new + n)
@@ -456,8 +457,8 @@ def _relative_residual(value, allowed):
 def motion_residuals(f, sizes, t, rtol, atol, runs, parameters, states_q, states_v, ends, scratch, worst):
     """Store in worst[k] the largest residual of the equations, relative to its limit, at the end of run runs[k].
 
-    The equations are C = 0, C_q v + C_t = 0, C_q a = gamma and M a + C_q^T lam = Q. The limit is `rtol` times the
-    terms of the equation, and for constraints also the effect of errors `atol` of coordinates and velocities.
+    The equations are C = 0, C_q v + C_t = 0, C_q a = gamma (if given) and M a + C_q^T lam = Q. The limit is `rtol`
+    times the magnitude of an equation's terms; for constraints, the effect of errors `atol` of q, v or a is added.
     sizes : n, n_c and the index in f.p of the first parameter; runs : (m,) indices of runs, or -1 to skip an entry;
     parameters : (n_runs, n_p); states_q, states_v : (m, n, n_t), with the end as the last time; ends : (m, n + n_c)
     a and lam at the end; scratch : (n (n + 3) + n_c (n + 3),) overwritten; worst : (m,).

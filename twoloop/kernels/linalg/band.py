@@ -142,7 +142,7 @@ def add_banded_mass_times(f, w, x, y):
 
 @inlined
 def lu_band(numbers, n, b):
-    """Return the part of `numbers` for B (bandwidth b), later for the LU of B; entry (i, j) is at [j, 2 b + i - j]."""
+    """Return the part of `numbers` with a matrix of bandwidth b or its LU; entry (i, j) is at [j, 2 b + i - j]."""
     return numbers[: n * (3 * b + 1)].reshape((n, 3 * b + 1))
 
 
@@ -191,7 +191,7 @@ def factor_bordered(w, b, Cq, numbers, pivots, factorize, substitute):
 
 @compiled
 def solve_bordered(w, b, Cq, numbers, pivots, substitute, x):
-    """Replace r, given as x, by the solution x of [[B, Cq^T], [Cq, 0]] [x; mu] = [r; 0]; see `factor_bordered`."""
+    """Solve [[B, Cq^T], [Cq, 0]] [x; mu] = [r; 0] by the factors of `factor_bordered`; `x`: r on entry, x on return."""
     n_c, n = Cq.shape
     band, exchanges = lu_band(numbers, n, b), pivots[: n - n_c].view(np.int32)
     call_lapack(w.lapack[substitute], (NO_TRANSPOSE, n, b, b, 1, band, 3 * b + 1, exchanges, x, n))

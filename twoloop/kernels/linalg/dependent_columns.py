@@ -8,16 +8,16 @@ from twoloop.kernels.data.common import INTEGERS, MATRIX, VECTOR, compiled, i8, 
 
 # kinds of entries of the constraint Jacobian G: NONE is always zero, NUMBER is constant, VARIES depends on positions.
 # In this module, R contains the rows of G during the elimination, and K (same shape) the kinds of the entries of R.
-# columns[i] lists the columns of the entries of row i whose kind is not NONE; row_sizes[i] is their number
+# columns[i] lists the columns in which row i has an entry that is not NONE; row_sizes[i] is the number of these columns
 NONE, NUMBER, VARIES = 0, 1, 2
-ROWS_SEARCHED = 4  # to save time, pivot blocks are sought only in this number of rows, which have the fewest entries
+ROWS_SEARCHED = 4  # to save time, pivot blocks are sought only in the ROWS_SEARCHED rows with the fewest entries
 # limits for a pivot block: three pairs, from strict to loose, are tried until a block meets both limits of a pair
-# - MAX_SQUARES: a block's equations express its coordinates by other coordinates; this limits the sum of squares of the
-#   coefficients of the other coordinates
+# - MAX_SQUARES: a block's equations express its coordinates by other coordinates. The squared coefficients in these
+#   equations must have a sum below this limit
 # - MIN_SINE_SQUARES: smallest squared sine of the angle between the columns of two pivots; for a single pivot, smallest
 #   squared ratio of the pivot to the norm of its column of G
-# With the first pair, pivots stay large for 98 % of a turn of a spatial four-bar, with the second for 34 %. The last
-# limits are well above MIN_PIVOT_SQUARE of generate/null_space.py, so that a choice stays valid for some motion
+# With the first pair, pivots stay large for 98 % of a turn of a spatial four-bar, with the second for 34 %. Generated
+# code fails if a squared sine falls below MIN_PIVOT_SQUARE (generate/null_space.py): even the loosest limit is above it
 MAX_SQUARES, MIN_SINE_SQUARES = (4.0, 20.0, 200.0), (0.2**2, 0.1**2, 0.04**2)
 MIN_CONSTANT_PIVOT = 1e-3  # smallest constant that may be a pivot, relative to the largest entry of its row
 CANCELLATION = 1e-12  # in an elimination, the difference a - b of constants counts as zero up to this fraction of |b|

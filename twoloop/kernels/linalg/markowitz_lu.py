@@ -34,7 +34,7 @@ ORDER_CHOSEN, SINGULAR_MATRIX, TOO_MANY_ENTRIES = range(3)  # codes of `choose_o
     N_HEAD,
 ) = range(7)
 # The array `values` contains the diagonal, then the rows of U from the last to the first, then the rows of L from the
-# first to the last. The array `index` contains the numbers above, and then
+# first to the last. The array `index` contains the N_HEAD numbers SIZE to WIDTH, and then
 # - row indices of the Jacobian, then its column indices, both in the order of elimination
 # - row exchanges by `lu_factor`, if the factors are dense
 # - indices in `values` where each row of U begins, where each row of U ends, where each row of L begins, where L ends
@@ -53,8 +53,8 @@ ORDER_CHOSEN, SINGULAR_MATRIX, TOO_MANY_ENTRIES = range(3)  # codes of `choose_o
     LOOKUP,  # scratch, for each row (or column): where its entry in the current column (or row) is stored
     N_COUNTS,
 ) = range(7)
-# indices in `lists`, scratch for choosing an order. COLUMNS, SOURCES: for each row, the columns of its entries, and the
-# indices of their initial values in the argument `entries` of `factor`. ROWS: for each column, the rows of its entries
+# indices in `lists`, scratch for choosing an order. COLUMNS: for each row, columns of its entries. SOURCES: where the
+# initial values of these entries are in the argument `entries` of `factor`. ROWS: for each column, rows of its entries
 COLUMNS, SOURCES, ROWS, N_LISTS = range(4)
 
 
@@ -64,12 +64,12 @@ def index_size(r: int) -> int:
 
 
 def values_size(r: int, may_be_dense: bool = True) -> int:
-    """Return the length of `values`, the array for the factors of r rows: sparse or, if `may_be_dense`, also dense."""
+    """Return the length of `values` for r rows: enough for sparse factors, and for dense ones if `may_be_dense`."""
     return r * (r if may_be_dense else min(r, MAX_ENTRIES_PER_LINE)) + r
 
 
 def max_subtractions(r: int) -> int:
-    """Return the largest number of subtractions of a program for r rows; if there are more, factors are dense."""
+    """Return how many subtractions a program for r rows may have; if more are needed, factors are dense."""
     return min(r * r * (r + 1) // 2, MIN_SUBTRACTIONS + SUBTRACTIONS_PER_ROW * r)
 
 
@@ -111,7 +111,7 @@ def index_of_lower_begins(r):
 
 @merged
 def index_of_entries(r):
-    """Return the offset of three lists in a program for r rows: row, column, source (see SOURCES) of factor entries."""
+    """Return where three lists begin in a program for r rows: rows, columns and SOURCES of factor entries."""
     return N_HEAD + 6 * r + 1
 
 

@@ -11,7 +11,7 @@ from numba import types
 from twoloop.kernels.data.common import INTEGERS, MATRIX, VECTOR, compiled, f8, i8, kernel, merged
 from twoloop.kernels.linalg.dense import copy_matrix, largest_of, ldl_factor, ldl_solve, ldl_solve_rows
 
-ROUNDING_OF_SQUARES = 4.0 * 2.0**-52  # rounding error of dot products of n rows, relative to n * (sum of their |row|^2)
+ROUNDING_OF_SQUARES = 4.0 * 2.0**-52  # rounding error of A A^T / (number of rows of A * sum of squared entries of A)
 REORTHOGONALISE_BELOW = 0.5  # a row is orthogonalised again if |orthogonal part|^2 is below this fraction of |row|^2
 
 
@@ -51,7 +51,7 @@ def select_rows(G, min_sine, basis, factors, kept):
     A row is selected if the sine of its angle to the span of the rows selected before exceeds `min_sine`. This angle is
     found by Gram-Schmidt orthogonalisation, which is repeated if the orthogonal part of the row is small. On return,
     the rows of `basis` are orthonormal, and the matrix of selected rows is the lower triangle `factors` times `basis`.
-    Both arrays have one row more than G can have independent rows; this row is scratch.
+    If G can have n independent rows, both arrays need n + 1 rows; the last one is scratch.
     """
     n_kept = 0
     for k in range(len(G)):
@@ -146,21 +146,21 @@ def singular_values_exceed(rows, ratio, gram):
     return math.isfinite(total) and ldl_factor(gram)
 
 
-BOUND_ROUNDING = 1e-12  # a bound of pivots is reduced by this fraction, so that a pivot equal to the bound is above it
-NOT_DEFINITE, STAYS_SINGULAR = -1, -2  # codes: M + sum s g^T g is not positive definite; no rows g make it invertible
+BOUND_ROUNDING = 1e-12  # a bound of pivots is reduced by this fraction: a pivot equal to the bound counts as above it
+NOT_DEFINITE, STAYS_SINGULAR = -1, -2  # codes: M + sum s g^T g is not positive definite; it is singular for any rows g
 TINY = 1e-300  # replaces zero as a divisor
 # Limits that decide whether a row of G is independent of previous rows. S = G M^-1 G^T, scaled to a diagonal of 1, is
 # factored. A row is independent if its pivot in S exceeds INDEPENDENT: then its part orthogonal to previous rows is at
 # least 3e-9 of its norm, the square root of INDEPENDENT * SIMILAR_EIGENVALUES. A row is dependent if this part is at
-# most DEPENDENT times its norm. If some row is neither, or if the smallest eigenvalue of the mass matrix M may be below
-# SIMILAR_EIGENVALUES times the largest, `select_rows` decides for all rows
+# most DEPENDENT times its norm. If a row is neither independent nor dependent by these limits, or if the smallest
+# eigenvalue of the mass matrix M may be below SIMILAR_EIGENVALUES times the largest, `select_rows` decides for all rows
 SIMILAR_EIGENVALUES, INDEPENDENT, DEPENDENT = 1e-7, 1e-10, 1e-10
-# A redundant row is a linear combination of independent rows, all scaled to norm 1. It replaces an independent row if
-# the coefficient of this row exceeds MAX_COEFFICIENT. Then the independent rows are farther from becoming dependent,
-# as rows do at dead centres. Coefficients of 1, which are common, must not cause exchanges
+# A redundant row is a linear combination of independent rows, all scaled to norm 1. If the coefficient of an
+# independent row exceeds MAX_COEFFICIENT, the redundant row replaces this row. So independent rows are less likely to
+# become dependent, for example at dead centres. Coefficients of 1, which are common, must not cause exchanges
 MAX_COEFFICIENT = 1.5
 TIE_RATIO = 1.01  # coefficients count as equal up to this ratio, so that rounding errors do not choose among them
-ZERO_ENTRY = 1e-12  # entries up to this fraction of the largest in their row count as zero: they may be rounding errors
+ZERO_ENTRY = 1e-12  # an entry up to this fraction of its row's largest entry counts as zero: it may be a rounding error
 
 
 def workspace_size(n_rows: int, n: int) -> int:
@@ -201,7 +201,7 @@ def _eigenvalue_bounds(mass):
 
 @compiled
 def _count_weak_eigenvalues(mass, weak_ratio, A):
-    """Count eigenvalues of M = `mass` up to z = weak_ratio * (upper bound of all); store factors of M - z I in A."""
+    """Count eigenvalues of M = `mass` up to limit = weak_ratio * (bound of the largest); factor M - limit I in A."""
     _, largest = _eigenvalue_bounds(mass)
     copy_matrix(mass, A)
     for i in range(len(mass)):
@@ -224,9 +224,9 @@ def _sort_rows_by_entries(G, order, counts):
 
 @merged
 def _removes_weak_eigenvalue(A, g, scale, x):
-    """Return True if adding scale * g^T g to the mass matrix M raises an eigenvalue of M above a limit z.
+    """Return True if adding scale * g^T g to the mass matrix M raises a weak eigenvalue above the limit for weak ones.
 
-    Then det(M - z I) changes its sign. A: factors of M - z I; g: a row of the Jacobian; x: scratch.
+    Then det(M - limit I) changes its sign. A: factors of M - limit I; g: a row of the Jacobian; x: scratch.
     """
     for j in range(x.size):
         x[j] = g[j]
@@ -239,9 +239,9 @@ def _removes_weak_eigenvalue(A, g, scale, x):
 
 @merged
 def _add_rows_to_mass(mass, G, weak_ratio, scale, A, x, order, added):
-    """Add scale * g^T g to the mass matrix M, for some rows g of G, until all its eigenvalues are large enough.
+    """Add scale * g^T g to the mass matrix M, for some rows g of G, until all eigenvalues of M exceed a limit.
 
-    All eigenvalues must exceed `weak_ratio` times an upper bound of the largest. Rows are tried in the sequence of
+    The limit is `weak_ratio` times an upper bound of the largest eigenvalue. Rows are tried in the sequence of
     `order`; on return, -1 replaces added rows in `order`. Store the indices of added rows in `added`; return their
     number, or STAYS_SINGULAR if eigenvalues are still too small and no further row helps.
     """
@@ -278,9 +278,9 @@ def _list_rows(is_kept, kept):
 def _exchange_rows(C, is_kept, kept):
     """Exchange independent rows with redundant rows, so that the independent ones are farther from dependence.
 
-    C[i, k] is the coefficient of independent row k in redundant row i, both scaled to norm 1. The rows are exchanged if
-    |C[i, k]| exceeds MAX_COEFFICIENT: this multiplies the volume that independent rows span by |C[i, k]|. Update C and
-    `is_kept` (1: independent, 0: redundant); store the indices of independent rows in `kept`, and return their number.
+    C[i, k] is the coefficient of independent row k in redundant row i, both scaled to norm 1. Two rows are exchanged if
+    |C[i, k]| exceeds MAX_COEFFICIENT. This multiplies the volume spanned by independent rows by |C[i, k]|. Update C
+    and `is_kept` (1: independent, 0: redundant). Store the indices of independent rows in `kept`; return their number.
     """
     n = len(C)
     n_kept = _list_rows(is_kept, kept)
@@ -395,8 +395,8 @@ def _first_bound_below_pivots(S, kept, n_kept, largest_inverse, bounds, scratch)
     """Return the index of the first of `bounds` that is below all pivots of S; if there is none, return bounds.size.
 
     S is G M^-1 G^T, scaled to a diagonal of 1, for the rows `kept` of G. A bound z is below all pivots, whatever the
-    order of elimination, if S - z I is positive definite. This cannot be so if z exceeds the smallest pivot,
-    1 / `largest_inverse`. If `largest_inverse` is 0, it is computed first.
+    order of elimination, if S - z I is positive definite. This matrix is not positive definite if z
+    exceeds the smallest pivot, 1 / `largest_inverse`. If `largest_inverse` is 0, compute it first.
     """
     shifted = scratch[: n_kept * n_kept].reshape((n_kept, n_kept))
     if largest_inverse == 0.0:
@@ -416,7 +416,7 @@ def _first_bound_below_pivots(S, kept, n_kept, largest_inverse, bounds, scratch)
 
 @merged
 def _mark_independent_rows(G, min_sine, basis, factors, coefficients, C, kept, is_kept):
-    """Set `is_kept` to 1 for the rows of G that `select_rows` selects, else to 0: these are redundant.
+    """Set `is_kept` to 1 for the rows of G that `select_rows` selects, and to 0 for the others, the redundant rows.
 
     C[i, k] becomes the coefficient of independent row k in redundant row i, both scaled to norm 1. The arrays
     `basis`, `factors`, `coefficients` and `kept` are scratch.
@@ -436,12 +436,12 @@ def _mark_independent_rows(G, min_sine, basis, factors, coefficients, C, kept, i
 
 @kernel(i8(MATRIX, MATRIX, f8, f8, VECTOR, VECTOR, INTEGERS), vectorized=True)
 def choose_rows(original_mass, G, min_sine, weak_ratio, bounds, workspace, chosen):
-    """Choose the independent rows of G, and rows g for which M + sum s g^T g is invertible (M: `original_mass`).
+    """Choose independent rows of G, and rows g that make M = `original_mass` invertible if s g^T g is added (s > 0).
 
-    Rows of G are selected by limits (see INDEPENDENT) or by `select_rows`, then exchanged by `_exchange_rows`. Rows g
-    are chosen if weak_ratio > 0 and M has eigenvalues below `weak_ratio` times the largest. Return the index of the
-    first of `bounds` that is below all pivots of G M^-1 G^T, scaled to a diagonal of 1; bounds.size if there is none;
-    on failure, STAYS_SINGULAR or NOT_DEFINITE. Other results (n_rows: number of rows of G):
+    Rows of G are selected by their pivots (see INDEPENDENT) or by `select_rows`, then exchanged by `_exchange_rows`.
+    Rows g are chosen if weak_ratio > 0 and M has eigenvalues below `weak_ratio` times the largest. Return the index of
+    the first of `bounds` that is below all pivots of G M^-1 G^T, scaled to a diagonal of 1; bounds.size if there is
+    none; on failure, STAYS_SINGULAR or NOT_DEFINITE. Other results (n_rows: number of rows of G):
 
     - chosen[0], chosen[1]: number of independent rows, number of rows g. Two lists of length n_rows follow: the indices
       of independent rows, and of rows g. The remaining n_rows numbers are scratch
@@ -467,7 +467,7 @@ def choose_rows(original_mass, G, min_sine, weak_ratio, bounds, workspace, chose
         largest_inverse = _find_dependent_rows(S, G, sizes, U, C, x, order)
     if largest_inverse > 0.0:
         chosen[0] = n_kept = _exchange_rows(C, order, kept)
-        # the largest 1 / pivot becomes unknown (0) if there are redundant rows, because rows may have been exchanged
+        # if there are redundant rows, rows may have been exchanged: then 0 says that the largest 1 / pivot is unknown
         largest_inverse = largest_inverse if n_kept == n_rows else 0.0
         first_bound = _first_bound_below_pivots(S, kept, n_kept, largest_inverse, bounds, scratch)
         if first_bound < bounds.size:  # all pivots exceed a bound: the chosen rows are certainly independent

@@ -201,7 +201,7 @@ def _is_equal(A, B):
 
 @merged
 def factor_schur_complement(f, w):
-    """Store in w.S the factors of G M^-1 G^T, unless it has them already (M constant, G unchanged); return a code."""
+    """Factor G M^-1 G^T in w.S, unless M is constant and w.S already has the factors for this G; return a code."""
     is_constant = f.constant_mass == 1
     if is_constant and _is_equal(w.G, w.G_of_S):
         return DONE
@@ -241,8 +241,8 @@ def solve_by_schur_complement(f, w, r, c, a):
             a[j] -= M_inverse_G[i, j] * w.z[i]
 
 
-# the augmented form needs at least MIN_ROWS constraints (measured: it is fastest from 7 on), and as many degrees of
-# freedom. If M is not diagonal, MIN_COORDINATES coordinates suffice in place of these (measured: fastest from about 30)
+# the augmented form is used with at least MIN_ROWS constraints (measured: fastest from 7 on) and at least MIN_ROWS
+# degrees of freedom. If M is not diagonal, these may be fewer from MIN_COORDINATES coordinates on (measured: about 30)
 MIN_ROWS = 8
 MIN_COORDINATES = 32
 

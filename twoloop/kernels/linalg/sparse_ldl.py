@@ -60,7 +60,7 @@ def _fill_stiffness(program, mass, jacobian, stiffness, scratch):
 
 @merged
 def fill_saddle_matrix(program, mass, jacobian, values, stiffness, scratch):
-    """Store in `values` the matrix [M G^T; G 0]; to a singular M, add s g^T g (g: row of G; s: `_fill_stiffness`)."""
+    """Store [M G^T; G 0] in `values`; if M is singular, add s g^T g for rows g of G, with s of `_fill_stiffness`."""
     for s in range(values.size):
         values[s] = 0.0
     _, _, slots = mass_entries_of(program)
@@ -80,10 +80,10 @@ def fill_saddle_matrix(program, mass, jacobian, values, stiffness, scratch):
 def factor(program, is_independent, values, sizes, min_sine_square):
     """Replace the matrix in `values` by its factors; return the smallest squared sine of angles between rows of G.
 
-    The angle is between a row and the span of previous rows. Its squared sine is -pivot / (squared norm of the row);
-    `sizes` receives the squared norms, and the diagonal 1/pivot. On entry, `is_independent` is 0 for rows that count as
-    redundant. It is set to 0 for rows with a squared sine of at most `min_sine_square`. The factors leave out rows with
-    `is_independent` = 0. If a pivot of a coordinate is not positive (M is not positive definite), return NOT_DEFINITE.
+    The angle is between a row and the span of previous rows. Its squared sine is -pivot / (squared norm of the row).
+    The squared norms are stored in `sizes`, 1 / pivot in the diagonal of the factors. Rows with is_independent = 0 on
+    entry are redundant. For rows with a squared sine of at most `min_sine_square`, is_independent becomes 0, too.
+    Factors of redundant rows are 0. If the pivot of a coordinate is not positive (M not definite), return NOT_DEFINITE.
     """
     (n_q, n) = program[N_COORDINATES], program[N_PIVOTS]
     order, runs = pivot_order_of(program), update_runs_of(program)
@@ -158,10 +158,10 @@ def solve(program, values, stiffness, x, y):
 
 @compiled
 def add_terms_of_redundant_rows(program, jacobian, is_independent, stiffness, rhs, right):
-    """Add s c g^T to `right`, a right-hand side, for each redundant row g of G that was added to M as s g^T g.
+    """For each redundant constraint g a = c whose row g was added to M as s g^T g, add s c g^T to the vector `right`.
 
-    So the solution stays the same, although the equation g a = c of this row is not among those that are solved. s is
-    the row's number in `stiffness`, and c its number in `rhs`.
+    So the solution stays the same, although g a = c is not among the equations that are solved. `stiffness` contains
+    the number s of each row; `rhs` contains n_q forces, then the number c of each row.
     """
     n_q = program[N_COORDINATES]
     _, columns, _ = jacobian_entries_of(program)

@@ -46,9 +46,9 @@ def newton_program(
     body_groups: Iterable[Sequence[int]],
     stiff_rows: Sequence[int],
 ) -> NDArray[np.int32] | None:
-    """Return the program that factors Newton's matrix; None if the program would be too long.
+    """Return the program that factors Newton's matrix; None if it has more updates than `program_in_order` allows.
 
-    `tangents`: entries of K and D (derivatives of forces), both triangles, in the order of `grouped_entries`. For the
+    `tangents`: entries of K and D (derivatives of forces), in both triangles, as sorted by `grouped_entries`. For the
     other arguments see `factorization_program`.
     """
     groups = column_groups(tangents, n_q)[tangents[1]]
@@ -60,7 +60,7 @@ def newton_program(
 
 
 def grouped_entries(tangents: Entries, n_q: int) -> Entries:
-    """Return `tangents`, the entries of K and D (derivatives of the forces), sorted by groups of columns."""
+    """Return `tangents`, the entries of K and D (derivatives of forces), sorted by the groups of `column_groups`."""
     sequence = np.argsort(column_groups(tangents, n_q)[tangents[1]], kind="stable")
     return tangents[0][sequence], tangents[1][sequence]
 
@@ -71,7 +71,7 @@ def column_groups(entries: Entries, n_q: int) -> Integers:
     for i, j in zip(*(indices.tolist() for indices in entries), strict=True):
         rows_of[j].append(i)
     groups = np.zeros(n_q, dtype=np.int64)
-    groups_by_row: list[set[int]] = [set() for _ in range(n_q)]  # for each row: groups of columns with entries there
+    groups_by_row: list[set[int]] = [set() for _ in range(n_q)]  # for each row: groups of columns with entries in it
     for j, rows in enumerate(rows_of):
         groups_in_rows = set().union(*(groups_by_row[i] for i in rows))
         groups[j] = group = next(k for k in range(n_q) if k not in groups_in_rows)
@@ -82,7 +82,7 @@ def column_groups(entries: Entries, n_q: int) -> Integers:
 
 @inlined
 def tangent_entries_of(program):
-    """Return three arrays: row and column of each entry of K and D (force derivatives), and bounds of column groups."""
+    """Return rows and columns of the entries of K and D (force derivatives), and where groups of columns begin."""
     group_begins = program[end_of_sections(program) :]
     rows, columns, _ = mass_entries_of(program)
     n_mass = rows.size - group_begins[group_begins.size - 1]
@@ -117,7 +117,7 @@ def fill_newton_matrix(program, mass, jacobian, K, D, z, stiffness, values):
 
 @compiled
 def factor(program, is_independent, values, sizes):
-    """Replace the matrix in `values` by its factors L U (diagonal: 1/pivot); return False if a pivot is too small.
+    """Replace the matrix in `values` by factors L U (diagonal: 1/pivot); return False if a pivot is small (MIN_PIVOT).
 
     Redundant rows (0 in `is_independent`) have factors of 0, so that they do not affect solutions. `sizes` is scratch.
     """

@@ -53,23 +53,24 @@ class _DisjointSets:
 
 
 class _PartSupports:
-    """Record the supports (ground and hubs, see the module's docstring) of each part during the elimination."""
+    """Record the supports of each part (set of connected bodies): the ground and hubs to which joints connect it."""
 
     def __init__(self, joints: Sequence[frozenset[int]], n_bodies: int, hubs: set[int], lone_bodies: AbstractSet[int]):
         self.joints, self.hubs = joints, set(hubs)  # bodies of each joint; hubs that are not eliminated yet
-        # hubs with a single coordinate: joints with such hubs may immobilize a part, so count as joints with the ground
+        # hubs with one coordinate. A joint with such a hub may immobilize other bodies, and counts as a ground joint
         self.lone_bodies = lone_bodies
         self.parts = _DisjointSets(n_bodies)
         self.is_grounded = [False] * n_bodies
-        self.hubs_by_part: list[set[int]] = [set() for _ in range(n_bodies)]  # index: smallest body of the part
-        self.supported_bodies: dict[int, list[int]] = {hub: [] for hub in hubs}  # a body of each part supported so far
+        self.hubs_by_part: list[set[int]] = [set() for _ in range(n_bodies)]  # [k]: hubs that joints connect to part k
+        self.supported_bodies: dict[int, list[int]] = {hub: [] for hub in hubs}  # [hub]: bodies of parts joined to it
 
     def can_eliminate(self, joint: int) -> bool:
         """Return True if a joint may be eliminated before the remaining hubs (bodies with many joints).
 
-        A part is a set of bodies that eliminated joints connect; the ground or hubs support it. The joint may be
-        eliminated if it involves no hub, and no hub supports a part that it connects. It may also be eliminated if one
-        of these parts has no support, unless the joint involves one of the `lone_bodies`.
+        A part is a set of bodies that eliminated joints connect. Supports of a part are the ground and hubs to which
+        eliminated joints connect the part. The joint may be eliminated in either of two cases:
+        - The joint involves no hub, and no part that the joint connects has a hub as a support.
+        - The joint involves none of the `lone_bodies` (hubs with one coordinate), and connects a part without support.
         """
         bodies = self.joints[joint]
         parts = {self.parts.find(body) for body in bodies if body not in self.hubs}
@@ -78,13 +79,13 @@ class _PartSupports:
         return not bodies & self.hubs and not any(self.hubs_by_part[p] for p in parts)
 
     def eliminate_joint(self, joint: int) -> None:
-        """Merge the parts (sets of connected bodies) that an eliminated joint connects, and update their supports."""
+        """Merge the parts (sets of connected bodies) that an eliminated joint connects; record the joint's hubs."""
         bodies = self.joints[joint]
         is_grounded = len(bodies) == 1 or bool(bodies & self.lone_bodies)
         self._merge_parts((body for body in bodies if body not in self.hubs), is_grounded, bodies & self.hubs)
 
     def eliminate_hub(self, hub: int) -> None:
-        """Merge an eliminated hub (body with many joints) and the parts that it supports, and update their supports."""
+        """Merge an eliminated hub (body with many joints) with the parts to which joints connect it."""
         self.hubs.discard(hub)
         supported_bodies = self.supported_bodies.pop(hub)
         for body in supported_bodies:
@@ -92,7 +93,7 @@ class _PartSupports:
         self._merge_parts([hub, *supported_bodies], False, frozenset())
 
     def _merge_parts(self, bodies: Iterable[int], is_grounded: bool, hubs: AbstractSet[int]) -> None:
-        """Merge the parts that contain `bodies`; add `hubs` and, if `is_grounded`, the ground to their supports."""
+        """Merge the parts that contain `bodies`; join the result to `hubs` and, if `is_grounded`, to the ground."""
         first, *others = bodies
         part = self.parts.find(first)
         for body in others:
@@ -193,7 +194,7 @@ def _minimum_degree_order(
 ) -> list[int]:
     """Return the order of elimination of joints and hubs as indices: k for joint k, len(joints) + k for hub k.
 
-    Hubs are bodies with many joints. Of the allowed joints and hubs, the next one is that whose neighbours have the
+    Hubs are bodies with many joints. Next is the hub, or joint allowed by `can_eliminate`, whose neighbours have the
     fewest rows and coordinates (`sizes`). `pairs`: hubs coupled without a joint. `lone_bodies`: see `_PartSupports`.
     """
     n_joints = len(joints)
@@ -250,9 +251,9 @@ Entries = tuple[Integers, Integers]  # row indices and column indices of the non
     N_OFF_DIAGONAL,  # number of entries of L below the diagonal
     N_UPDATES,  # number of updates in the elimination, each a multiplication and a subtraction
     N_RUNS,  # length of the list from `update_runs_of`: two numbers for each range of updates
-    N_OF_MASS,  # number of listed entries of the mass matrix M
-    N_OF_JACOBIAN,  # number of listed entries of the constraint Jacobian G
-    N_STIFFENED,  # number of products g_i g_j in the terms s g^T g (g: row of G) that are added to a singular M
+    N_OF_MASS,  # number of entries of the mass matrix M in the list from `mass_entries_of`
+    N_OF_JACOBIAN,  # number of entries of the constraint Jacobian G in the list from `jacobian_entries_of`
+    N_STIFFENED,  # number of terms s g_i g_j (s: factor, g: row of G) that are added to M if M is singular
     N_HEAD,
 ) = range(9)
 ALWAYS_ALLOWED_UPDATES = 3_000_000  # a program is always written if it has at most this number of updates
@@ -283,7 +284,7 @@ def program_in_order(
 ) -> NDArray[np.int32] | None:
     """Return the program for an order of elimination; None if its updates would be too many (see MAX_UPDATES).
 
-    If `unsymmetric`, factors are L U: entry (i, j) of U is program[N_OFF_DIAGONAL] numbers behind entry (j, i) of L.
+    If `unsymmetric`, factors are L U: entry (i, j) of U is program[N_OFF_DIAGONAL] numbers after entry (j, i) of L.
     """
     n = len(order)
     position = np.empty(n, dtype=np.int64)
@@ -328,11 +329,11 @@ def program_in_order(
 
 
 def _update_runs(targets: Integers, diagonal: NDArray[np.bool_]) -> Integers:
-    """Divide the elimination's updates of off-diagonal entries into ranges that change adjacent entries.
+    """Find ranges of adjacent off-diagonal entries that successive updates of the elimination change.
 
     `targets`: for each update, the index of the entry that it changes; `diagonal`: whether this entry is on the
     diagonal. Return the length of each range and the index of its first entry. Ranges are long, because the rows of a
-    joint are adjacent in all columns: so entries are changed as vectors, and programs are a tenth as long.
+    joint are adjacent in all columns. So programs change vectors instead of entries, and are a tenth as long.
     """
     off_diagonal = np.flatnonzero(~diagonal)
     begins = np.flatnonzero(diagonal[off_diagonal - 1] | (targets[off_diagonal] != targets[off_diagonal - 1] + 1))
@@ -341,7 +342,7 @@ def _update_runs(targets: Integers, diagonal: NDArray[np.bool_]) -> Integers:
 
 
 def _products_of_entries(rows: Integers, chosen: Sequence[int]) -> tuple[Integers, Integers, Integers]:
-    """Return the row, first entry and second entry (indices) of each product in g^T g, for the rows g in `chosen`."""
+    """For each pair of entries in a `chosen` row, return this row and both indices; `rows`: the row of each entry."""
     parts: list[tuple[Integers, Integers, Integers]] = [(rows[:0], rows[:0], rows[:0])]
     sequence = np.argsort(rows, kind="stable")
     sorted_rows = rows[sequence]
@@ -385,7 +386,7 @@ def _columns_of_factors(n: int, low: Integers, high: Integers) -> list[Integers]
 
 @inlined
 def end_of_sections(program):
-    """Return the index behind the sections of a program, where `newton_program` adds groups of columns."""
+    """Return the index after the sections of a program, at which `newton_program` adds groups of columns."""
     begin = N_HEAD + 2 * program[N_PIVOTS] + 1 + program[N_OFF_DIAGONAL] + program[N_RUNS]
     return begin + 3 * (program[N_OF_MASS] + program[N_OF_JACOBIAN]) + 4 * program[N_STIFFENED]
 
@@ -429,9 +430,9 @@ def jacobian_entries_of(program):
 
 @inlined
 def stiffening_products_of(program):
-    """Return four lists with one number for each product g_i g_j in terms s g^T g (g: row of G) added to a singular M.
+    """For each product g_i g_j added to a singular M (g: row of G), return indices of g, g_i, g_j and the entry of M.
 
-    The numbers: index of the row g, indices of g_i and of g_j, and index, in the factors, of the changed entry of M.
+    The result consists of four lists. The index of the entry of M is its slot, the index in the array of the factors.
     """
     n = program[N_STIFFENED]
     begin = N_HEAD + 2 * program[N_PIVOTS] + 1 + program[N_OFF_DIAGONAL] + program[N_RUNS]

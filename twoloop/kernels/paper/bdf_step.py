@@ -25,7 +25,7 @@ MAX_ITERATIONS = 60  # number of fixed-point iterations after which a step has f
 SAFETY = 0.9  # safety factor on sizes of repeated steps; after an accepted step, (next size) / (size) is at least this
 MIN_STEP_FACTOR = 0.2  # smallest (next size) / (size) after rejected steps, or if predicted positions are inaccurate
 ERROR_FACTOR = 10.0  # factor on the error estimate, because the errors of many short steps add up
-STEP_SIZE_FACTOR = 6.0  # further factor on error estimates that set the next step size, to avoid rejections, as in VODE
+STEP_SIZE_FACTOR = 6.0  # factor on error estimates for the next step size, so that few steps are rejected (as in VODE)
 ORDER_FACTOR = 1.4  # factor on the error estimates of the next lower and higher order, so that the order changes rarely
 MIN_INCREASE = 1.2  # the step size is kept if it could grow by less than this factor
 MAX_INCREASE = 2.0  # largest ratio of successive step sizes
@@ -34,7 +34,7 @@ MAX_INCREASE = 2.0  # largest ratio of successive step sizes
 HIGHEST, INNER_TOL, OUTER_TOL, N_OPTION_SCALARS = range(4)
 # indices of the scalars in `memory`; the arrays of _coefficient_row and _history_views follow
 (
-    HAS_TRIAL,  # 1: a step was computed that is not yet accepted or rejected; 0: no step, or the attempt has failed
+    HAS_TRIAL,  # 1: the attempt has given a step, which is not accepted or rejected yet; else 0
     ORDER,  # order of the next attempt
     DEPTH,  # order of the highest difference in the history
     AGE,  # number of accepted steps since the last change of order or the last rejected step
@@ -67,7 +67,7 @@ def _coefficient_row(memory, row):
 
 @inlined
 def _history_views(memory, n):
-    """Return views of `memory`: differences of the history and of the attempt, a prediction and its rate, and scratch.
+    """Return views of `memory`: differences of the history, those of the attempt, a prediction, its rate, and scratch.
 
     The first two are tables (N_DIFFERENCES, 2 n): row k contains the differences of order k of (q, v). `prediction` is
     the predicted (q, v) at the end of the step, and `rate` its time derivative (2 n each).
@@ -83,7 +83,7 @@ def _history_views(memory, n):
 
 @kernel(COMMIT)
 def commit_bdf(f, w, options, memory, tolerances, accepted):
-    """Set the order of the next step; if the last step was accepted, its differences replace the history."""
+    """Set the order of the next step; if the last step was accepted, the differences at its end become the history."""
     differences, trial, _, _, _ = _history_views(memory, w.Q.size)
     has_trial = memory[HAS_TRIAL]
     memory[HAS_TRIAL] = 0.0
@@ -156,10 +156,10 @@ def _corrector_coefficient(h, k):
 
 @compiled
 def _correct_state(f, w, options, t, c, prediction, rate, new_state, a_new):
-    """Solve y = prediction + c (y' - rate) at time t, for the independent entries y = (q_i, v_i); return a code.
+    """Solve the corrector's equation y = prediction + c (y' - rate) at time t for y = (q_i, v_i); return a code.
 
     The outer loop iterates on the independent accelerations. On return, `new_state` is [q, v, a, lam], and satisfies
-    the equations of motion and the constraints. `c`: see `_corrector_coefficient`; a_new: scratch.
+    the equations of motion and the constraints. c: `_corrector_coefficient`; rate: predicted y'; a_new: scratch.
     """
     n = w.Q.size
     q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
@@ -232,7 +232,7 @@ def _choose_order(options, memory, tolerances, trial, y, y1, d):
             memory[NEXT_ORDER] = k - 1
         return error, max(SAFETY * error ** (-1.0 / (k + 1)), MIN_STEP_FACTOR)
     factor = (STEP_SIZE_FACTOR * here) ** (-1.0 / (k + 1))
-    if memory[AGE] >= k:  # error estimates for other orders require k + 1 steps at this order k
+    if memory[AGE] >= k:  # errors of other orders can be estimated after k + 1 steps of order k, this step included
         lower, higher = (STEP_SIZE_FACTOR * below) ** (-1.0 / k), (STEP_SIZE_FACTOR * error_above) ** (-1.0 / (k + 2))
         if lower > max(factor, higher):
             memory[NEXT_ORDER] = k - 1

@@ -31,7 +31,7 @@ from twoloop.kernels.steps.stages import (
 
 @kernel(COMMIT)
 def commit_runge_kutta(f, w, options, memory, tolerances, accepted):
-    """If the attempted step was accepted, keep its stage accelerations and rounding errors for the next step."""
+    """If the attempted step was accepted, keep its stage accelerations and the rounding errors of q and v."""
     s, n = int(options[STAGES]), w.Q.size
     if accepted and memory[at.HAS_TRIAL] == 1.0:
         previous, trial = memory_block(memory, s, n, at.A_PREVIOUS), memory_block(memory, s, n, at.A_TRIAL)
@@ -92,7 +92,7 @@ def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
         )
         if code != DONE:
             return Attempt(code, np.inf, 0.0)
-        # the prediction error of the whole step does not count, because the end of the whole step is discarded
+        # use the prediction errors of both half steps; that of the whole step does not count: its end is discarded
         prediction_error = max(prediction_error, prediction_error_mid)
         code, error = estimate_and_extrapolate(
             f, w, options[EXTRAPOLATION], options[INNER_TOL], t + h, tolerances, q, v, q_full, v_full, q1, v1

@@ -82,8 +82,8 @@ UNDECIDED, CONVERGED, DIVERGED = range(3)  # codes of `_test_convergence`
 def _test_convergence(change, last_change, first_change, rounded, iteration, tolerance, q):
     """Decide whether an iteration has converged: return UNDECIDED, CONVERGED or DIVERGED.
 
-    It has converged if the stages change by at most `tolerance`, or if rounding errors of q keep their change from
-    decreasing. `rounded`: change of the stages relative to max(1, |value|), to be compared with rounding errors.
+    It has converged if the stages change by at most `tolerance`, or if this change does not decrease, and may be due
+    to rounding errors of q. `rounded`: change relative to max(1, |value|), to be compared with rounding errors.
     """
     if change <= tolerance:
         return CONVERGED
@@ -107,7 +107,7 @@ def _compensated_sum(x, rounding, increment):
 
 @merged
 def _clear_rounding_errors(coordinates, rounding):
-    """Set this attempt's rounding errors of dependent `coordinates` to 0: the inner loop changes these coordinates."""
+    """Set to 0 this attempt's recorded rounding errors of dependent `coordinates`, which the inner loop changes."""
     for i in range(N_ROUNDING // 2, rounding.shape[0]):
         for m in coordinates:
             rounding[i, m] = 0.0
@@ -115,12 +115,12 @@ def _clear_rounding_errors(coordinates, rounding):
 
 @compiled
 def iterate_accelerations(f, w, options, tolerances, t, h, q, v, A_stage, Q_stage, V_stage, q1, v1, rounding):
-    """Compute a step of size h from (q, v) by iterating on stage accelerations; return a code and `prediction_error`.
+    """Compute a step of size h from (q, v) by iterating on stage accelerations; return a code and a position error.
 
-    A_stage (s, n) contains predicted accelerations on entry, and the solution on return; (q1, v1) becomes the end of
-    the step, on the constraints. The stages Q_j = q + c_j h v + h^2 sum_k (A A)_jk a_k and V_j = v + h sum_k A_jk a_k
-    (A, c: Butcher tableau) then satisfy eq. (17) of the paper. For undamped systems, an iteration gains as much
-    accuracy as two by `iterate_first_order`. If `rounding` has rows, sums are compensated for rounding errors.
+    A_stage (s, n): predicted accelerations, on return final ones. (q1, v1) becomes the projected end of the step.
+    The stages Q_j = q + c_j h v + h^2 sum_k (A A)_jk a_k and V_j = v + h sum_k A_jk a_k (A, c: Butcher tableau) satisfy
+    eq. (17) of the paper. If `rounding` has rows, rounding errors of sums are compensated. The position error is
+    `prediction_error` of q1. For undamped systems, one iteration gains as much as two by `iterate_first_order`.
     """
     s, A, A2, b, bA, c = tableau_of(options)
     n = q.size

@@ -50,8 +50,8 @@ def _estimated_error(options, tolerances, rate, h, q, v, a, a1):
     """Return the estimated error of a step, in units of the tolerances; `rate` (1/s) is the result of `_motion_rate`.
 
     The leading local error of q for the parameter gamma = 1/2 is e = |beta - 1/6| h^2 |a1 - a|, with the accelerations
-    a and a1 at both ends. The result is the largest component of (e / h) / (rate atol + rtol |v|); the error e / h per
-    unit time is of order h^2, like that of the run. If ERROR_TOL > 0, it is |e|_2 / ERROR_TOL (err_out in the paper).
+    a and a1 at both ends. The result is the largest component of (e / h) / (rate atol + rtol |v|). The error per unit
+    time, e / h, is of order h^2, as is the run's error. If ERROR_TOL > 0, return |e|_2 / ERROR_TOL (paper: err_out).
     """
     factor = abs(options[BETA] - 1.0 / 6.0) * h
     total = 0.0

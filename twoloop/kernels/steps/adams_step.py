@@ -21,7 +21,7 @@ from twoloop.kernels.data.indices import ATOL, DONE, RTOL
 from twoloop.kernels.evaluation.inner_loop import evaluate_without_projection, project
 
 HIGHEST = 12  # largest order, as in Shampine and Gordon's STEP; the quadrature with NODES would be exact even for 13
-N_TERMS = HIGHEST + 2  # number of stored differences of accelerations, and of their coefficients for v and for q
+N_TERMS = HIGHEST + 2  # number of stored differences of accelerations; each has a coefficient for v and one for q
 ERROR_FACTOR = 5.0  # factor on the error estimate, because the errors of many short steps add up
 SAFETY = 0.8  # safety factor: ratio of the next step size to the size for which the estimate would equal the tolerance
 GROWTH, SHRINKAGE = 1.2, 0.5  # largest ratio of successive step sizes; smallest ratio after a rejected step
@@ -35,9 +35,9 @@ POSITION_WEIGHTS = WEIGHTS * (1.0 - NODES)  # weights with which c(s) at NODES y
 
 
 def _error_constants():
-    """Return |g_k - g_{k+1}| at equal steps for each order k from 0 to HIGHEST (g: coefficients for velocities).
+    """Return the error constants |g_k - g_{k+1}| of equal steps for orders k = 0 ... HIGHEST (g: see module docstring).
 
-    The estimate of the velocity error is h |g_k - g_{k+1}| d, where d is evaluated minus predicted accelerations.
+    The estimated velocity error is h |g_k - g_{k+1}| d, where d are the evaluated minus the predicted accelerations.
     """
     coefficients = np.ones(HIGHEST + 1)
     for k in range(1, HIGHEST + 1):
@@ -45,8 +45,8 @@ def _error_constants():
     return np.abs(coefficients)
 
 
-# error constants of equal steps. They replace error constants of unequal steps that are smaller: after a decrease of h,
-# those are so small that they would hide errors where forces jump
+# error constants of equal steps. They replace smaller constants for the actual step sizes: after a decrease of the step
+# size, error estimates with smaller constants would miss jumps of forces
 ERROR_CONSTANTS = _error_constants()
 
 THETA, N_OPTIONS = range(2)  # THETA: index in `options` of the tolerance of projections, see `project`
@@ -62,8 +62,9 @@ THETA, N_OPTIONS = range(2)  # THETA: index in `options` of the tolerance of pro
     NEXT_ORDER,  # order chosen at the end of an attempt for the next one
     N_SCALARS,
 ) = range(8)
-# indices of rows in `memory`. PSI, NEW_PSI: times (s) from earlier states to the last one, and to the end of the step.
-# BETA: factors that adapt differences to the step size. G_VELOCITY, G_POSITION: coefficients of the products in v, q
+# indices of rows in `memory`. PSI: times (s) from earlier states to the last state. NEW_PSI: times from these states to
+# the end of the step. BETA: factors that adapt differences to the step size. G_VELOCITY, G_POSITION: coefficients g_i
+# (for v) and G_i (for q) of the differences. C_AT_NODES: scratch for c_i(s) at NODES
 PSI, NEW_PSI, BETA, G_VELOCITY, G_POSITION, C_AT_NODES, N_ROWS = range(7)
 
 
@@ -85,9 +86,9 @@ def _row(memory, index):
 
 @inlined
 def _difference_table(memory, n, index):
-    """Return a view of table `index` (0 or 1) of differences: N_TERMS + 1 rows of n entries, padded.
+    """Return a view of difference table `index` (0 or 1): N_TERMS + 1 rows of n entries, padded to a multiple of 4.
 
-    Row i - 1 has the predicted difference phi_i of accelerations. The sum of this and the last row is the final phi_i.
+    Row i - 1 contains the predicted difference phi_i of accelerations. The last row is the correction to add to each.
     """
     width = (n + 3) // 4 * 4
     start = N_SCALARS + N_ROWS * (N_TERMS + 2) + int(index) * (N_TERMS + 1) * width
@@ -96,7 +97,7 @@ def _difference_table(memory, n, index):
 
 @inlined
 def _scratch_rows(memory, n):
-    """Return two scratch rows (n, padded), for means of accelerations in a step, later for 1 / (allowed errors)."""
+    """Return two padded scratch rows (n): first for mean accelerations in a step, later for 1 / (allowed errors)."""
     width = (n + 3) // 4 * 4
     start = N_SCALARS + N_ROWS * (N_TERMS + 2) + 2 * (N_TERMS + 1) * width
     return memory[start : start + width], memory[start + width : start + 2 * width]
@@ -152,7 +153,7 @@ def _compute_coefficients(memory, h, k):
         beta[i + 1] *= beta[i]
     for m in range(8):
         c[m] = 1.0
-    previous_psi = 0.0  # time (s) from the state i steps before the last accepted state to that state; 0 for i = 0
+    previous_psi = 0.0  # psi_i = t_n - t_{n-i} (s), the duration of the last i accepted steps; psi_0 = 0
     for i in range(k + 2):
         velocity_integral = 0.0
         position_integral = 0.0
@@ -224,9 +225,10 @@ def _predict_state(memory, h, k, old, new, state, q1, v1, n):
 
 @merged
 def _estimate_error(g, G, h, order, largest_v, largest_q):
-    """Return the estimated error of a step at `order`, in units of the tolerances; g, G: coefficients for v and for q.
+    """Return the estimated error of a step of size h by the method of a given order, in units of the tolerances.
 
-    `largest_v`, `largest_q`: largest |difference phi_{order+1}| / tolerance of velocities, and of positions.
+    `largest_v`: max|phi / (tolerance of velocity)|; `largest_q`: max|phi / (tolerance of position)|; phi is the
+    difference phi_{order+1} of accelerations. g, G: coefficients g_i and G_i, see the module docstring.
     """
     return max(h * abs(g[order - 1] - g[order]) * largest_v, h * h * abs(G[order - 1] - G[order]) * largest_q)
 

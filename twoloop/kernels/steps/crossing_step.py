@@ -41,14 +41,14 @@ MAX_LEFT_OUT_NODES = 9  # a step fails if more nodes than this are left out
 # and BASE the time (s) of its argument `base`. BEGIN, DURATION and END store the beginning, duration and end (s) of the
 # polynomial that the last converged attempt computed; if there is none, END contains -inf
 LARGEST_PIVOT, EARLIEST, MAY_APPROACH, NODE_DISTANCE, BASE, BEGIN, DURATION, END, N_STORED = range(9)
-SHORTEST_PIECE, LONGEST_PIECE = 0.05, 0.2  # limits of the steps along a polynomial, relative to its duration
+SHORTEST_PIECE, LONGEST_PIECE = 0.05, 0.2  # limits of (size of a piece) / (duration of polynomial), see `piece_ends`
 NODE_GAP = 0.0767  # longest time between two successive nodes, relative to the duration of the polynomial
-BACKWARD_FRACTION = 0.4  # largest part of the polynomial that precedes the step, relative to its whole duration
+BACKWARD_FRACTION = 0.4  # largest fraction of a polynomial's duration that may lie before the step
 ORDER, ERROR_FACTOR = 12.0, 0.5  # the error estimate has the factor ERROR_FACTOR, and is about proportional to h^ORDER
 PROJECTION_WEIGHT = 0.5  # if a projection changes a stage by x tolerances, the error estimate is at least this times x
 ROUNDING = 1e-13  # relative tolerance of the iteration in steps of fixed size, and of comparisons of times
-MIN_PIVOT_RATIO = 0.5  # a step fails if the pivot at its end is below this * pivot at its beginning; see FAR_END
-END_MARGIN = 2.0  # a step fails if the pivot at its end is below this * smallest pivot allowed at nodes; see FAR_END
+MIN_PIVOT_RATIO = 0.5  # a step fails if the pivot at its end is below this * pivot at its start or `base`; see FAR_END
+END_MARGIN = 2.0  # if MAY_APPROACH is 0, the end's pivot must be at least this * least pivot of nodes; see FAR_END
 FAR_END = 0.3  # the pivot at the end of a step is large enough if it is at least this * largest pivot of the run so far
 LATE = S - 4  # node near a polynomial's end: if its pivot exceeds the end's, the singular position lies beyond the end
 # an attempt that computes a polynomial returns this as error and as step-size factor. So the step is repeated; it then
@@ -73,8 +73,8 @@ def begin_polynomial(memory, largest_pivot, earliest, may_approach, node_distanc
     """Discard the polynomial in `memory`, and store the conditions that the next one must satisfy.
 
     `largest_pivot` is the largest pivot of the run so far; no node may lie before the time `earliest` (s). If
-    `may_approach`, the polynomial may end before the singular position, nearer to it than it begins. `node_distance`
-    is a factor on the pivot below which nodes are left out. The polynomial goes through `base`, the time (s) and state
+    `may_approach`, the polynomial need not cross the singular position, but may end before it. The pivot below which
+    nodes are left out is multiplied by `node_distance`. The polynomial goes through `base`, the time (s) and state
     [q, v, ...] of an earlier step; if `base` is None, it goes through the state at the beginning of the step.
     """
     stored = memory[-N_STORED:]
@@ -89,8 +89,8 @@ def begin_polynomial(memory, largest_pivot, earliest, may_approach, node_distanc
 def piece_ends(memory, c, t):
     """Divide the polynomial in `memory`, from t on, into steps ("pieces"); return the times (s) at which they end.
 
-    Pieces end at the end of the polynomial, at evaluated nodes next to a node that is left out, and at evaluated nodes
-    where the piece would otherwise be longer than LONGEST_PIECE. No piece is shorter than SHORTEST_PIECE.
+    Pieces end at the end of the polynomial, at evaluated nodes next to a node that is left out, and at the first
+    evaluated node where the piece is longer than LONGEST_PIECE. No piece is shorter than SHORTEST_PIECE.
     """
     stored = memory[-N_STORED:]
     left_out = memory[-N_STORED - 3 * S : -N_STORED - 2 * S] < 0.0
@@ -171,9 +171,9 @@ def _choose_partition_at_end(
 ):
     """Set (q1, v1) to the end (at time t) of the polynomial of duration h; choose the partition there; return a code.
 
-    The code is SINGULAR if the end is close to the singular position, or before it. Then the pivot at the end is below
-    FAR_END times the largest pivot of the run, and below `min_pivot`. If MAY_APPROACH is 0, `min_pivot` is first raised
-    to the pivot at the node LATE, and to END_MARGIN times `min_node_pivot`, the pivot below which nodes are left out.
+    The code is SINGULAR if the pivot at the end is below both `min_pivot` and FAR_END * largest pivot of the run: the
+    end is too near the singular position, or before it. If MAY_APPROACH is 0, `min_pivot` is raised to at least the
+    pivot at the node LATE, and at least END_MARGIN * `min_node_pivot`, the pivot below which nodes are left out.
     """
     A, AA, b, bA, c = tables
     if stored[MAY_APPROACH] == 0.0:
@@ -187,7 +187,7 @@ def _choose_partition_at_end(
 
 @compiled
 def _fill_integral_weights(b, c, c0, weights_v, weights_q):
-    """Store weights (S) that yield a polynomial's integral and double integral, 0 to c0, from its values at nodes c."""
+    """Store weights (S) that yield a polynomial's integral and double integral (0 to c0) from its values at nodes c."""
     weights_v[:] = 0.0
     weights_q[:] = 0.0
     for i in range(S):
@@ -202,7 +202,7 @@ def _fill_integral_weights(b, c, c0, weights_v, weights_q):
 
 @merged
 def _set_beginning_state(h, c0, weights_v, weights_q, a, q, v, q_0, v_0):
-    """Set (q_0, v_0) to the state at the beginning of the polynomial; (q, v) is its state at the time c0 h later."""
+    """Set (q_0, v_0) to the first state of a polynomial of duration h; (q, v): its state at the time c0 h."""
     sum_rows(weights_v, a, v_0)
     sum_rows(weights_q, a, q_0)
     for m in range(q.size):
@@ -212,7 +212,7 @@ def _set_beginning_state(h, c0, weights_v, weights_q, a, q, v, q_0, v_0):
 
 @compiled
 def _interpolate(x, c, nodes, a, value):
-    """Set `value` (n) to the value at x of the polynomial through a[k] (n) at c[k], for all k in `nodes` except -1."""
+    """Store in `value` the value at time x of the polynomial through a[k] at time c[k], for all k >= 0 in `nodes`."""
     value[:] = 0.0
     for node in nodes:
         if node >= 0:
@@ -241,8 +241,8 @@ def _polynomial_at(time, duration, b, c, a, q_0, v_0, weights_v, weights_q, q, v
 def _finish_piece(f, w, t, min_node_pivot, options, tolerances, stage, state, new_state):
     """Finish a step: project its end `stage` = [q, v, a], store it in `new_state`, and return an Attempt.
 
-    If `min_node_pivot` is positive, and the smallest pivot is below it or the projection fails, the state is stored
-    without projection.
+    If the smallest pivot is below `min_node_pivot`, or the projection fails, store the state without projection. If
+    `min_node_pivot` is 0, always project the state, and return the code of a projection that fails.
     """
     n = w.Q.size
     q, q1, v1 = state[:n], new_state[:n], new_state[n : 2 * n]
@@ -276,7 +276,7 @@ def state_at(memory, options, t):
     b, _, c = options[N_SCALARS + 3 * S * S :].reshape((3, S))
     a, stage = memory[: S * n].reshape((S, n)), memory[S * n : (S + 5) * n].reshape((5, n))
     fraction, duration, (q_0, v_0) = (t - stored[BEGIN]) / stored[DURATION], stored[DURATION], stage[3:]
-    # values of the Lagrange polynomials at the Gauss nodes of the interval from the beginning to t, and at t
+    # row k: values of the Lagrange polynomials at Gauss node k of the time from stored[BEGIN] to t; last row: at t
     weights = np.array([lagrange_values(c, x) for x in (*(fraction * c), fraction)])
     weights_v = fraction * b @ weights[:-1]
     weights_q = fraction**2 * (b * (1.0 - c)) @ weights[:-1]
@@ -293,7 +293,7 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
     b, bA, c = options[N_SCALARS + 3 * S * S :].reshape((3, S))
     a, stage, offset = memory[: S * n].reshape((S, n)), memory[S * n : (S + 5) * n].reshape((5, n)), (S + 7) * n
     q_stage, v_stage, a_stage, q_0, v_0 = stage[0], stage[1], stage[2], stage[3], stage[4]
-    kept, weights_v, weights_q = memory[offset : offset + 3 * S].reshape((3, S))  # kept[j]: j; -1: node j is left out
+    kept, weights_v, weights_q = memory[offset : offset + 3 * S].reshape((3, S))  # kept[j] = j; -1: node j is left out
     stored = memory[offset + 3 * S :]
     largest_pivot, earliest, time_of_base = stored[LARGEST_PIVOT], stored[EARLIEST], stored[BASE]
     is_estimated, uses_generated_code = tolerances[ESTIMATE] == 1.0, f.is_generated == 1
@@ -314,7 +314,7 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
         if is_estimated:
             duration = h + max(0.0, min(h * BACKWARD_FRACTION / (1.0 - BACKWARD_FRACTION), t - earliest))
     begin, c0 = t + h - duration, (duration - h) / duration
-    c_base = c0 if t_base == t else 0.0  # time from the polynomial's beginning to `base` / its duration
+    c_base = c0 if t_base == t else 0.0  # (time from the polynomial's beginning to `base`) / (polynomial's duration)
     _fill_integral_weights(b, c, c_base, weights_v, weights_q)
     n_before_base = 0  # number of nodes before the state `base`
     while n_before_base < S and c[n_before_base] < c_base:
@@ -356,7 +356,7 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
             if chooses_nodes:
                 code = renew_partition(f, w, time, q_stage)
                 kept[j] = j
-                if code == DONE:  # this pivot may be the largest of the run, if the start was near a singular position
+                if code == DONE:  # a run that began near a singular position may have its largest pivot at this stage
                     stored[LARGEST_PIVOT] = largest_pivot = max(largest_pivot, w.pivot)
                 if is_estimated and (code != DONE or w.pivot < min_node_pivot * largest_pivot):
                     kept[j], n_kept, code = -1.0, n_kept - 1, DONE
@@ -399,7 +399,7 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
             has_converged = True
             break
         _set_beginning_state(duration, c_base, weights_v, weights_q, a, q_base, v_base, q_0, v_0)
-        # test the pivot at the end already after two sweeps: the end is accurate enough, and most failures occur here
+        # already after two sweeps, test the pivot at the end: q is accurate enough, and this test finds most failures
         if sweep == 1 and is_estimated:
             min_pivots = MIN_PIVOT_RATIO * pivot, min_node_pivot * largest_pivot
             code = _choose_partition_at_end(f, w, t + h, duration, stored, *min_pivots, tables, a, *states)
@@ -418,7 +418,7 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
     code = _choose_partition_at_end(f, w, t + h, duration, stored, *min_pivots, tables, a, *states)
     if code != DONE:
         return Attempt(code, np.inf, 0.0)
-    if is_estimated:  # the next steps follow this polynomial
+    if is_estimated:  # the step has variable size: repeat it along this polynomial
         stored[BEGIN], stored[DURATION], stored[END] = begin, duration, t + h
         return Attempt(DONE, REPEAT_FACTOR, REPEAT_FACTOR)
     copy(q1, q_stage)

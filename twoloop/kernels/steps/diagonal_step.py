@@ -16,7 +16,7 @@ newton_step.py, which solves all stages together, uses one set of derivatives fo
 multiplies derivatives by the inverse of T^T M T. For a matrix that is used in one iteration, this is twice the work.
 
 Under step-size control, a step of TR-BDF2 (order 2) ends close to the result of its embedded formula of order 3: the
-difference of both results is multiplied by filters (I - z J)^-1 with the Jacobian J, and then subtracted from that of
+difference of the results is multiplied by filters (I - z J)^-1 with the Jacobian J, and subtracted from the result of
 order 2. The filter keeps the method L-stable. The tolerance limits the difference, but the error of a step is smaller:
 errors of many short steps add up to about the tolerance, not to a multiple of it. `f`: kit, `w`: workspace.
 """
@@ -222,7 +222,7 @@ def stages_at_once(options):
 
 @compiled
 def _update_derivatives(f, w, options, tolerances, memory, t, h, Q, V, F):
-    """If they are outdated, compute derivatives at (t, Q, V; accelerations F) and Newton's factors; return a code."""
+    """If Newton's Jacobian or its factors are outdated, renew them at (t, Q, V), accelerations F; return a code."""
     if f.force_by_q_given == 1 or memory[at.HAS_JACOBIAN] == 0.0:
         multipliers(f, w, t, Q, V, F, w.lam)
         memory[at.HAS_JACOBIAN] = 1.0
@@ -315,7 +315,7 @@ MAX_RATIO_BY_ONE_JUMP = 0.174
 
 @compiled
 def _filter_errors(f, w, options, memory, h, e_q, e_v):
-    """Remove stiff components of the estimated errors (e_q, e_v): multiply them by (I - z J)^-1, using stored factors.
+    """Remove stiff components of the errors (e_q, e_v): multiply by (I - z J)^-1 (J: Jacobian), using stored factors.
 
     z = h gamma; J is the Jacobian of velocities and accelerations by (q_i, v_i), the independent entries. The estimated
     errors of q and v are the first n_dof entries of e_q and e_v (n_q); the other entries are scratch.
@@ -353,7 +353,7 @@ def _store_weighted_sums(w, h, V_stage, A_stage, weights, factor, e_q, e_v):
 
 @compiled
 def _renew_derivatives(f, w, options, tolerances, memory, t, h, new_state):
-    """Compute derivatives at the end (t, `new_state`) of a step of size h; factor Newton's matrices; return a code."""
+    """Renew Newton's Jacobian, and its factors for step size h, at a step's end (t, `new_state`); return a code."""
     n = w.Q.size
     Q, V, F = vector(memory, 1, n, at.Q_MID), vector(memory, 1, n, at.V_MID), vector(memory, 1, n, at.A_MID)
     copy(new_state[:n], Q)
@@ -374,7 +374,7 @@ def _renew_derivatives(f, w, options, tolerances, memory, t, h, new_state):
 
 @compiled
 def _estimate(f, w, options, memory, t, h, tolerances, state, new_state, V_stage, A_stage, weights, factor):
-    """Estimate the error of a step by sums of its stages times `weights`; return its largest component in tolerances.
+    """Estimate the error of a step by sums of stages times `weights`; return the largest component in tolerances.
 
     Stiff components do not count, because the estimate is filtered (Hosea and Shampine 1996). If derivatives are so old
     that the filter is wrong, they are computed anew. At the end, E_Q and E_V contain the estimate filtered twice.
@@ -431,9 +431,9 @@ def _apply_embedded_formula(f, w, options, memory, h, q1, v1):
 
 @compiled
 def _error_in_slow_directions(f, w, options, memory, h, tolerances, state, new_state, A_stage):
-    """Return the effect, in tolerances, of the slowly decaying part of the estimated velocity error E_V in `memory`.
+    """Return the effect on coordinates, in tolerances, of the slowly decaying part of the estimated velocity error E_V.
 
-    If all of E_V has an effect of at most 1, return 0. E_Q, E_V and Newton's factors are overwritten.
+    If all of E_V has an effect of at most 1, return 0. E_Q, E_V and Newton's factors, in `memory`, are overwritten.
     """
     n = w.Q.size
     e_q, e_v = vector(memory, 1, n, at.E_Q), vector(memory, 1, n, at.E_V)
@@ -489,7 +489,7 @@ def commit_diagonal(f, w, options, memory, tolerances, accepted):
     if accepted:
         s = int(options[at.DIAGONAL_OFFSET])
         _, A_stage, a_end = stage_views(memory, s, w.Q.size)
-        copy(A_stage[s - 1], a_end)  # in accelerations at the new state, stiffness would amplify Newton's last error
+        copy(A_stage[s - 1], a_end)  # not accelerations at the new state, where stiffness amplifies Newton's error
         memory[at.IS_FRESH] = 0.0
 
 

@@ -82,7 +82,7 @@ def _vector_view(memory, n, index):
 
 @compiled
 def _add_weighted_slopes(y, h, weights, slopes, total, y1):
-    """Set y1 to y + h * (sum of weights[k] * slopes[k]); first, the sum is stored in `total`, to reduce rounding."""
+    """Store the sum of weights[k] * slopes[k] in `total`, then y + h * total in y1; adding y last reduces rounding."""
     sum_rows(weights, slopes, total)
     for m in range(y.size):
         y1[m] = y[m] + h * total[m]
@@ -138,7 +138,7 @@ def explicit_step(f, w, options, memory, t, h, tolerances, state, new_state):
     )
     begin, width = N_VECTORS * _padded_width(n), _padded_width(n)
     slopes = memory[begin : begin + s * width].reshape((s, width))  # velocities and accelerations of each stage
-    # near a singular position, all stages are projected: otherwise, they could be beyond it, or their velocities wrong
+    # near a singular position, all stages are projected: unprojected ones could be beyond it or have wrong velocities
     is_near = options[FREE] == 1.0 and w.nearly_singular != 0.0
     is_free = options[FREE] == 1.0 and not is_near
     ratio_to_gap = gap_ratio(tolerances, h)

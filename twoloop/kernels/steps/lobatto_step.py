@@ -51,7 +51,7 @@ from twoloop.kernels.linalg.dense import copy
     N_ITERATED,  # number of coordinates on which accelerations depend; only these change in the fixed-point iteration
     N_ROWS,  # number of constraints
     FREE,  # the defect is also evaluated between nodes if step size > FREE * (longest time between evaluations)
-    MAY_REPEAT,  # 1: a sweep may evaluate accelerations twice; 0: only once, as two would cost twice as much
+    MAY_REPEAT,  # 1: sweeps may evaluate accelerations twice; 0: only once, as the second time would cost as much
     N_OPTIONS,
 ) = range(6)
 
@@ -59,7 +59,7 @@ START_CONTRACTION = 0.12  # the first step size is guessed so that a sweep multi
 MAX_GUESSES = 4  # largest number of guesses of the first step size
 FACTOR_AFTER_DIVERGENCE = 0.6  # ratio of the next step size to the size of a step whose iteration did not converge
 SAFETY = 0.75  # safety factor on the step size for which the estimated error would equal the tolerance
-# counter at which another method takes over; steps limited by convergence add 1, other steps subtract 1 down to 0
+# at this count, another method takes over: a step limited by convergence adds 1, any other subtracts 1 (not below 0)
 MAX_LIMITED = 24.0
 # accelerations hardly vary in a step if the Legendre coefficients of degrees 5 and 6 are below this many tolerances
 MIN_CURVATURE = 0.1
@@ -68,16 +68,16 @@ MIN_PIVOT_RATIO = 0.4  # another method takes over if a step multiplies the smal
 # if the smallest tolerance is below this, another method takes over once a singular position was near. Without this
 # rule, five more runs of the benchmark A02 (N-four-bar mechanism) end with wrong results
 TIGHT_TOLERANCE = 1e-8
-MAX_FAILURES = 12.0  # counter at which another method takes over; diverged steps add 2, accepted steps subtract 1
+MAX_FAILURES = 12.0  # at this count, another method takes over: unconverged steps add 2, accepted steps subtract 1
 CHECKED_GAP = 0.0908  # (longest time between evaluations) / (step size), if the defect is evaluated between nodes, too
 # largest ratio of successive step sizes: GROWTH_EARLY in the first N_EARLY steps of a run, GROWTH in later steps
 N_EARLY, GROWTH_EARLY, GROWTH = 6, 4.0, 1.3
 GROWTH_ONE_SWEEP = 30.0  # largest ratio of step sizes early in a run, after a step that took only one sweep
 MIN_FACTOR = 0.4  # smallest ratio of the next step size to the size of an accepted step
-LEAST_TREND = 0.4  # lower limit of `trend`, the ratio of the step sizes that the errors of this and the last step allow
+LEAST_TREND = 0.4  # lower limit of `trend`: (size that a step's error allows) / (size that the previous error allowed)
 GAIN_BY_REPEATS = 1.5  # (step size that converges with two evaluations of accelerations per sweep) / (size with one)
-# sweeps stop evaluating accelerations twice (REPEATS = 0) if the convergence allows steps this many times as long as
-# the error estimate allows: the second evaluation then saves no time
+# sweeps no longer evaluate accelerations twice (REPEATS = 0) if (step size that convergence allows) / (step size that
+# the error estimate allows) exceeds this: second evaluations then save no time
 MAX_REACH = 2.5
 MAX_EXTRAPOLATION = 3.0  # upper limit of (step size that the error of a step allows) / (size of this step)
 _array_offsets = merged(array_offsets)
@@ -153,11 +153,11 @@ def _solve_collocation(f, w, options, data, tolerances, t, h, state):
         max_factor = min(max_factor, factor_by_defect)
     max_factor = min(max_factor, h_max / h)
     extra_sweeps = data[field.SWEEPS] - data[field.N_TARGET]
-    # the motion may be stiff if accelerations hardly vary, but sweeps are at most one fewer than intended (N_TARGET)
+    # the motion may be stiff if accelerations hardly vary, but the number of sweeps is at least its target value - 1
     is_limited = data[field.CURVATURE] < MIN_CURVATURE and extra_sweeps >= -1.0
     data[field.LIMITED] = max(0.0, data[field.LIMITED] + (1.0 if is_limited else -1.0))
-    # `trend`: ratio of the step sizes that the errors of this and of the last step allow. A trend below 1 probably
-    # continues, so the next step size is multiplied by the trend
+    # `trend`: (size that this step's error allows) / (size that the previous step's error allowed). A trend below 1
+    # probably continues, so the next step size is multiplied by the trend
     h_allowed = h * min(data[field.FACTOR_OF_ERROR], MAX_EXTRAPOLATION)
     if error > 1e-6 and data[field.CURVATURE] >= MIN_CURVATURE:
         trend = 1.0 if is_first else min(max(h_allowed / data[field.ALLOWED_H], LEAST_TREND), 1.0)
@@ -313,7 +313,7 @@ def _adopt_projection(f, w, options, data, tolerances, driven, n, k, t, row, sta
 
 @merged
 def _can_take_next_step(w, data, tolerances, control, clock, h):
-    """Return False if the integrator must act before the next step: its size h is too small, or the method unsuited."""
+    """Return False if the integrator must act before the next step: if h is too small, or the method must change."""
     h_long = clock[at.H_LONG]
     if h <= control[at.SHORTEST] or h < COLLAPSED_STEP * h_long or _must_change_method(w, data, tolerances):
         return False
@@ -347,7 +347,7 @@ def _take_steps(f, w, options, data, tolerances, control, clock, goal, state, n_
         out_t[n_ends], out_steps[n_ends, at.H] = t, h
         data[field.DEFECTS + n_ends] = data[field.DEFECT]
         copy(state[: 2 * n], out_state[n_ends, : 2 * n])
-        # if this step was shortened to end at `goal`, the next one may have the size that this one should have had
+        # if this step was shortened to end at `goal`, the next step may have the intended size, `h_wanted`
         clock[at.H_NEXT] = max(h * factor, h_wanted) if h < h_wanted else h * factor
         n_ends += 1
     return n_ends
@@ -357,7 +357,7 @@ def _take_steps(f, w, options, data, tolerances, control, clock, goal, state, n_
 def lobatto_steps(
     f, w, options, memory, tolerances, control, clock, goal, state, new_state, out_t, out_state, out_steps
 ):
-    """Take at most LANES steps in a row, and project their ends together; return the number of accepted steps.
+    """Take at most LANES successive steps, and project their ends together; return the number of accepted steps.
 
     The last step is the one that makes the run's number of accepted steps a multiple of LANES. So results do not depend
     on where the integrator pauses, for example to look for Ctrl-C: the same steps are always projected together.

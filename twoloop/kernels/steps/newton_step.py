@@ -56,8 +56,8 @@ from twoloop.kernels.steps.velocity_errors import STEPS_TO_DECAY, filtered_veloc
 
 # the next step computes new derivatives if the last Newton correction exceeds this fraction of the previous one
 SLOW_CONTRACTION = 0.05
-# in steps of fixed size, rounding may prevent that corrections decrease to the tolerance. So Newton's method has also
-# converged if the last correction is at most this number times max(1, |corrected value|)
+# in steps of fixed size, rounding may keep corrections from decreasing to the tolerance. So Newton's method has also
+# converged if the last correction is at most MAX_ROUNDING_CORRECTION_FIXED * max(1, |corrected value|)
 MAX_ROUNDING_CORRECTION_FIXED = 1e-9
 
 
@@ -143,7 +143,7 @@ def _solve_stages(f, w, options, memory, t, h, tolerances, q, v, A_stage):
 
 @compiled
 def _filter_errors(f, w, options, memory, h, e_q, e_v):
-    """Remove stiff components of the error estimates (e_q, e_v): multiply these by (I - z J)^-1, with the Jacobian J.
+    """Multiply the error estimates (e_q, e_v) by (I - z J)^-1, with a Jacobian J, to remove their stiff components.
 
     J: derivative of (v_i, a_i) by (q_i, v_i). z: step size h times the constant GAMMA0 of the method. The estimates are
     the first n_dof entries of the vectors e_q and e_v (n_q each); the other entries are scratch.
@@ -257,8 +257,8 @@ def newton_step(f, w, options, memory, t, h, tolerances, state, new_state):
     node = middle_node(c)
     while True:
         if memory[at.HAS_JACOBIAN] == 0.0:
-            # compute derivatives at the middle stage: its stiff directions differ least from those at other stages. At
-            # the middle of the step, a short force that acts at no stage might change the derivatives
+            # compute derivatives at the middle stage, whose stiff directions differ least from those at other stages.
+            # At a time between stages, a short force that acts at no stage might change these derivatives
             dt = node * h
             for m in range(n):
                 q_mid[m] = q[m] + dt * (v[m] + 0.5 * dt * a[m])

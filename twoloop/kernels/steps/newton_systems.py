@@ -74,7 +74,7 @@ from twoloop.kernels.steps.stages import (
 
 MAX_ITERATIONS = 15  # largest number of Newton iterations: if they do not converge, the step fails
 EQUAL_STEP_TOLERANCE = 1e-9  # step sizes count as equal up to this relative difference, which rounding of times causes
-# rounding may prevent that corrections decrease to the tolerance of Newton's method. So the method has also converged
+# because of rounding, corrections may stay above the tolerance of Newton's method. So the method has also converged
 # if the last correction is at most this fraction of the smallest tolerance of the run
 MAX_ROUNDING_CORRECTION = 0.1
 
@@ -88,7 +88,7 @@ DISPLACEMENT_INCREMENT, N_INCREMENTS = 0.37, 7
 
 @inlined
 def _displacement_sizes(tolerances, x):
-    """Return the typical and the largest size of components of x (q or v), from which displacements follow."""
+    """Return two sizes of x (q or v) for finite differences: the typical one, and the largest |component|."""
     return typical_size(tolerances, x), largest_of(x)
 
 
@@ -176,9 +176,9 @@ def _subtract_reaction_tangent(f, w, tolerances, t, q, moved, b, K):
 
 @compiled
 def fill_tangent_by_q(f, w, tolerances, t, q, v, b, moved, K, R):
-    """Store K (n_q, n_q), the derivative of the forces with reactions, Q - C_q^T lam, by q; only for |i - j| <= b.
+    """Store K (n_q, n_q), derivative of the forces with reactions, Q - C_q^T lam, by q: the entries with |i - j| <= b.
 
-    Return a code. The last evaluation must have been at (t, q, v). `moved` (n_q) and R (n_q, n_q) are scratch.
+    Return a code. The last evaluation must have been at (t, q, v). b: bandwidth. `moved` (n_q), R (n_q, n_q): scratch.
     """
     _clear_band(K, b)
     f.force_by_q(t, q, v, f.p, K)
@@ -195,7 +195,7 @@ def fill_tangent_by_q(f, w, tolerances, t, q, v, b, moved, K, R):
 
 @compiled
 def fill_tangent_by_v(f, t, q, v, b, D):
-    """Store the entries of dQ/dv (Q: forces) with |i - j| <= b in D (n_q, n_q), if dQ/dv is given; return a code."""
+    """Store the band |i - j| <= b of dQ/dv (Q: forces) in D, if a callback gives it; return DONE or NOT_FINITE."""
     if f.force_by_v_given == 0:
         return DONE
     _clear_band(D, b)
@@ -264,7 +264,7 @@ def _fill_jacobians_from_tangents(f, w, tolerances, memory, s, t, q, v):
 
 @compiled
 def _fill_by_differences(f, w, options, tolerances, t, q, v, a, by_v, q_moved, v_moved, a_new, J):
-    """Store in J the derivative of accelerations by q_i (if `by_v`, by v_i), as differences from `a` at (t, q, v)."""
+    """Store in J the derivative of accelerations by q_i (if `by_v`, by v_i); `a`: accelerations at (t, q, v)."""
     base, moved = (v, v_moved) if by_v else (q, q_moved)
     sizes = _displacement_sizes(tolerances, base)
     for column in range(w.independent.size):
@@ -360,8 +360,8 @@ def _band_view(numbers, n, b):
 def _border_views(w, n, r, b):
     """Return three arrays that were stored together with K: independent rows of C_q, w.D, and dependent coordinates.
 
-    Sizes: (r, n), (n - r + 1, r), (r). w.D contains, transposed, the derivative of the dependent velocities by the
-    independent ones; its last row contains the dependent velocities due to C_t. The arrays follow the band of K.
+    Sizes: (r, n), (n - r + 1, r), (r); r: number of rows. w.D contains, transposed, the derivative of the dependent
+    velocities by the independent ones, then the dependent velocities due to C_t. The arrays follow the band of K.
     """
     numbers = matrix_storage(w, n, at.DERIVATIVE_Q)
     start = n * (2 * b + 1)
@@ -540,8 +540,8 @@ def _filter_error_banded(f, w, options, memory, s, h, e_q, e_v):
 
 # --- sparse storage, for all coordinates
 
-# K lacks entries if a displacement d of q changes a component i of the residual by a number that differs from
-# sum_j K_ij d_j by more than this fraction of sum_j |K_ij d_j|. D, the derivative by v, is tested like K
+# the change of component i of the residual by a displacement d of q is compared with sum_j K_ij d_j. If they differ by
+# more than this fraction of sum_j |K_ij d_j|, then K lacks entries. D, the derivative by v, is tested like K
 MAX_DEVIATION = 0.2
 RESIDUAL_ROUNDING = 1e-13  # rounding error of a difference of residuals, relative to the largest term of a residual
 N_SPARSE_VECTORS = 3  # number of real scratch vectors, which _sparse_scratch returns first
@@ -562,7 +562,7 @@ def matrices_size(program: np.ndarray, n_mass: int, n_jacobian: int, n_systems: 
 def _sparse_derivative_views(f, w):
     """Return six views of w.matrices: the entries of M, G, K and D, then `is_independent` and `stiffness`.
 
-    For each row g of G, `is_independent` is 1 or 0, and `stiffness` is s if s g^T g is added to a singular M.
+    For each row g of G, `is_independent` is 1 or 0. If s g^T g is added to a singular M, `stiffness` is the factor s.
     """
     n_mass, n_jacobian, n_rows = w.mass_values.size, w.jacobian_values.size, w.is_independent.size
     begin_K = n_mass + n_jacobian
@@ -581,7 +581,7 @@ def _sparse_derivative_views(f, w):
 
 @inlined
 def _sparse_scratch(f, w):
-    """Return scratch views of w.matrices: three vectors (n_q), pivot sizes (N = n_q + n_c), two complex vectors (N)."""
+    """Return scratch views of w.matrices: three vectors (n_q), one (N, the number of pivots), two complex ones (N)."""
     n, begin = f.newton_program[N_PIVOTS], w.mass_values.size + w.jacobian_values.size
     begin += 2 * (mass_entries_of(f.newton_program)[0].size - w.mass_values.size) + 2 * n
     n_q, numbers = w.Q.size, w.matrices
@@ -632,10 +632,10 @@ def _fill_sparse_residual(f, w, t, q, v, renews_G, out):
 
 @compiled
 def _fill_tangent_entries_by_differences(f, w, tolerances, t, q, v, by_v, base, residual, moved, entries):
-    """Store the `entries` of K (if `by_v`, of D), finite differences of the residual; return DONE or NOT_FINITE.
+    """Store the `entries` of K (of D if `by_v`), differences of the forces with reactions; return DONE or NOT_FINITE.
 
-    Columns of a group have no rows in common: one difference yields them all. `base`: residual at (t, q, v);
-    `residual` and `moved` (n_q): scratch.
+    Columns of a group have no rows in common: one difference yields them all. `base`: forces with reactions at
+    (t, q, v); `residual` and `moved` (n_q): scratch.
     """
     rows, columns, begins = tangent_entries_of(f.newton_program)
     base_point = v if by_v else q
@@ -737,7 +737,7 @@ def _factor_sparse_matrix(f, w, z, factors):
 
 @compiled
 def _fill_sparse_right_side(f, w, r, right):
-    """Store in `right` [M r; G r] (r: residual), plus terms of redundant rows g with s g^T g in M."""
+    """Store [M r; G r] in `right` (r: residual); for each redundant row g, add s g^T g r if M contains s g^T g."""
     mass, jacobian, _, _, is_independent, stiffness = _sparse_derivative_views(f, w)
     right[:] = 0.0
     rows, columns, _ = mass_entries_of(f.newton_program)
@@ -806,7 +806,7 @@ def factor_systems(f, w, options, memory, s, h):
     code = factor_filter(f, w, options, memory, s, h)
     offset += at.N_EIGEN_SCALARS + s
     for k in range(n_systems):
-        # if the first eigenvalue is real, it is GAMMA0, and `factor_filter` has already factorized the first matrix
+        # if the tableau's first eigenvalue is real, it is GAMMA0: `factor_filter` has already factorized its matrix
         if code == DONE and (k > 0 or n_real == 0):
             z = h * complex(options[offset], options[offset + 1])
             if f.form == FIXED_ORDER:
@@ -833,7 +833,7 @@ def _solve_system(f, w, memory, s, index, numbers, substitute, X, x):
 
 @compiled
 def _solve_sparse_system(f, w, numbers, right, y, x):
-    """Replace x (n_q) by the solution of Newton's system, using the factors `numbers`; `right` and `y` are scratch."""
+    """Replace the residual x (n_q) by the solution of Newton's system; `numbers`: factors. `right`, `y`: scratch."""
     _fill_sparse_right_side(f, w, x, right)
     solve_lu(f.newton_program, numbers, right, y)
     copy(right[: x.size], x)
@@ -846,7 +846,7 @@ def solve_system(f, w, options, memory, s, k, x):
     If this eigenvalue is real, only the real part of x is used, and the solution is real.
     """
     n = w.Q.size
-    if k == 0 and options[newton_options_index(s) + at.N_REAL] > 0.0:  # the eigenvalue is real, and equals GAMMA0
+    if k == 0 and options[newton_options_index(s) + at.N_REAL] > 0.0:  # eigenvalue k is real: use the filter's factors
         real_part, X = vector(memory, s, n, at.V_MOVED), vector(memory, s, n, at.Q_MOVED)
         for i in range(x.size):
             real_part[i] = x[i].real
@@ -868,10 +868,10 @@ def solve_system(f, w, options, memory, s, k, x):
 
 @compiled
 def filter_error(f, w, options, memory, s, h, e_q, e_v):
-    """Remove stiff components from the velocity error e_v: e_v = (I - z^2 J_q - z J_v)^-1 (e_v + z J_q e_q).
+    """Remove stiff components from the velocity error e_v, with Newton's matrix and the position error e_q.
 
-    z: step size h times GAMMA0. J_q, J_v: derivatives of accelerations by q_i and v_i. The estimated errors of q and v
-    are the first n_dof entries of e_q and e_v (n_q each); the other entries are scratch.
+    Replace e_v by (I - z^2 J_q - z J_v)^-1 (e_v + z J_q e_q). z: h * GAMMA0. J_q, J_v: derivatives of accelerations by
+    q_i and v_i. Only the first n_dof entries of e_q and e_v (n_q each) are errors; the other ones are scratch.
     """
     m = w.independent.size
     if f.form == FIXED_ORDER:

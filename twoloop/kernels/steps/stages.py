@@ -140,7 +140,7 @@ def estimate_end_error(tolerances, options, h, state, new_state, A_stage):
     N_REAL,  # number of real eigenvalues of the matrix A of the Butcher tableau
     N_PAIRS,  # number of pairs of conjugate complex eigenvalues of the matrix A of the Butcher tableau
     GAMMA0,  # constant of the error filter: first real eigenvalue of the tableau's A; if none is real, min |eigenvalue|
-    TESTS_VELOCITIES,  # 1: limit the estimated velocity errors themselves; 0: limit their effects, see `velocity_error`
+    TESTS_VELOCITIES,  # 1: limit estimated velocity errors; 0: limit their effects on coordinates, see `velocity_error`
     N_EIGEN_SCALARS,
 ) = range(5)
 
@@ -157,7 +157,7 @@ def estimate_end_error(tolerances, options, h, state, new_state, A_stage):
     CONTRACTION,  # (last correction of Newton's method) / (the correction before it)
     HAS_DAMPING,  # 1: forces depend on velocities; 0: they do not, so that derivatives by velocities are zero
     IS_SYMMETRIC,  # 1: Newton's matrix in diagonal_step.py is symmetric, and factored as L D L^T; 0: factored as L U
-    ERROR_DURATION,  # time (s) for which a velocity error changes positions, see velocity_errors.py; 0: unknown
+    ERROR_DURATION,  # time (s) until a velocity error decays or changes its sign, see velocity_errors.py; 0: unknown
     DERIVATIVES_RENEWED,  # 1: diagonal_step.py has computed new derivatives at the end of the step; 0: it has not
     N_MEMORY_SCALARS,
 ) = range(14)
@@ -313,14 +313,14 @@ def system_storage(w, n, k):
 
 @inlined
 def _storage_after_vectors(memory, s, n, k):
-    """Return a view of 2 n numbers of `memory`, which begin k * n numbers behind the last vector (see A_NEW)."""
+    """Return a view of 2 n numbers of `memory`, from k * n numbers after the end of the vectors A_NEW to A_MID."""
     start = N_MEMORY_SCALARS + (N_BLOCKS * s + N_VECTORS + k) * n
     return memory[start : start + 2 * n]
 
 
 @inlined
 def pivots_of(memory, s, n, k):
-    """Return a view (n) of `memory` with pivot indices: if k = 0, those of FILTER; if k > 0, of linear system k - 1."""
+    """Return the pivot indices (n) of the matrix in `filter_error` (k = 0), or of linear system k - 1 (k > 0)."""
     return _storage_after_vectors(memory, s, n, k)[:n].view(np.int64)
 
 
@@ -332,7 +332,7 @@ def complex_vector(memory, s, n, n_systems, index):
 
 @kernel(ATTEMPT)
 def request_loading(f, w, options, memory, t, h, tolerances, state, new_state):
-    """Return NOT_LOADED without a step: then the caller loads the machine code of the method, and tries again."""
+    """Take no step, and return NOT_LOADED; then the caller loads the machine code of the method, and tries again."""
     return Attempt(NOT_LOADED, np.inf, 0.0)
 
 

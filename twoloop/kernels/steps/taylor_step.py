@@ -53,18 +53,18 @@ from twoloop.kernels.linalg.saddle_point import solve_with_multipliers
 # 13 arrays describe a list of operations (OperationGroups in twoloop.generate.series). Array 0 contains the groups of
 # operations of the same kind, arrays 1 to 6 the first argument of each operation, arrays 7 to 12 the second argument
 GROUPS, FIRST, SECOND, N_TABLE = 0, 1, 7, 13
-# six arrays describe a list of affine expressions (Sums in twoloop.generate.series), such as first arguments. For each
-# expression, three of them have the quantity (COLUMN) and factor (COEFFICIENT) of its first term, and its CONSTANT. For
-# each other term, the other three have its expression (ROW), quantity (MORE_COLUMN) and factor (MORE_COEFFICIENT)
+# six arrays describe a list of affine expressions (Sums in twoloop.generate.series), such as first arguments. Three
+# have an entry per expression: CONSTANT, and quantity (COLUMN) and factor (COEFFICIENT) of the first term. Three have
+# an entry per further term: its expression (ROW), quantity (MORE_COLUMN) and factor (MORE_COEFFICIENT)
 COLUMN, COEFFICIENT, CONSTANT, ROW, MORE_COLUMN, MORE_COEFFICIENT, N_SUMS = range(7)
-SUM_INDICES = N_SUMS  # seventh array of ROWS and BALANCE: index of the equation that each affine expression belongs to
+SUM_INDICES = N_SUMS  # seventh array, if the expressions belong to equations: index of each expression's equation
 # the series program is a list of arrays; its four parts begin at these indices. EARLY: operations on t and q only.
 # LATE: operations on t, q and v. ROWS, BALANCE: affine expressions for G v + (C_t, b) and Q - G^T lam - M a
 EARLY, LATE, ROWS = 0, N_TABLE, 2 * N_TABLE
 BALANCE, N_ARRAYS = ROWS + N_SUMS + 1, ROWS + 2 * (N_SUMS + 1)
-# columns of the array GROUPS, which has a row for each group of operations. KIND: kind of operation. BEGIN and END:
-# where the operations begin and end. MORE_FIRST and the next column: where terms of first arguments begin and end in
-# MORE_COLUMN. MORE_SECOND and the next column: where terms of second arguments begin and end in MORE_COLUMN
+# columns of the array GROUPS, which has a row for each group of operations. KIND: kind of operation. BEGIN, END: the
+# range of the group's operations. MORE_FIRST and the next column: the range of entries in MORE_COLUMN that belong to
+# first arguments. MORE_SECOND and the next column: the range of entries in MORE_COLUMN that belong to second arguments
 KIND, BEGIN, END, MORE_FIRST, _, MORE_SECOND, _, N_GROUP = range(8)
 
 # indices of the scalars in `memory`. Two Taylor series of q (ORDER + 1, n_q each) and arrays (`array_views`) follow.
@@ -77,9 +77,9 @@ KIND, BEGIN, END, MORE_FIRST, _, MORE_SECOND, _, N_GROUP = range(8)
     ALLOWED_SIZE,  # largest step size that the series about the beginning of the step allows, in units of UNIT
     NEXT_ALLOWED_SIZE,  # largest step size that the series about the end of the last attempt allows, in NEXT_UNIT
     TRIED,  # 1: the last attempt has computed the series about its end, where the next step may begin; 0: it has not
-    PASSED,  # time (s) from the expansion point of the series to the step; 0 unless steps share the series (KEEP = 1)
+    PASSED,  # time (s) from the series' expansion point to the step's beginning; 0 unless steps share a series (KEEP 1)
     TARGET,  # index (0 or 1) of the stored series that `compute_coefficients` overwrites
-    # step sizes are multiplied by this factor (at most 1), so that steps end near the constraints; 0: unknown
+    # steps are shortened by this factor (at most 1): longer ones would end too far from the constraints; 0: unknown
     DISTANCE_FACTOR,
     ATTEMPTS,  # number of attempts; it determines at which times within a step the defect is evaluated
     SUSPECTED,  # 1: memory[SUSPECT] contains a time that the run has not passed yet; 0: SUSPECT has no meaning
@@ -146,11 +146,11 @@ def sum_of_products(X, Y, K, total):
 
 @merged
 def _fill_arguments(options, sums, groups, g, more, values, out):
-    """Compute the first (or second) argument of each operation of a group; store the arguments in `out`.
+    """Compute the first or the second arguments of all operations of a group; store these arguments in `out`.
 
     Arguments are affine expressions in `values`, the Taylor coefficients of one order of all quantities; constants are
-    left out, as they belong to order 0. `sums`: index of the arrays of the expressions. `g`: index at which the group's
-    row begins in `groups`. `more`: MORE_FIRST for first arguments, MORE_SECOND for second ones.
+    left out, as they belong to order 0. `sums`: index of the first array (COLUMN) that describes these expressions.
+    `g`: where the group's row begins in `groups`. `more`: MORE_FIRST for first arguments, MORE_SECOND for second ones.
     """
     column, coefficient = _integer_array(options, sums + COLUMN), _float_array(options, sums + COEFFICIENT)
     for o in range(groups[g + BEGIN], groups[g + END]):
@@ -163,7 +163,7 @@ def _fill_arguments(options, sums, groups, g, more, values, out):
 
 @merged
 def _store_sums(options, sums, scale, values, out):
-    """Store in `out` the values of the expressions ROWS or BALANCE (`sums`), multiplied by `scale`; omit constants."""
+    """Store in `out` scale * (known variable terms of G v + (C_t, b) for ROWS, of Q - G^T lam - M a for BALANCE)."""
     column, coefficient = _integer_array(options, sums + COLUMN), _float_array(options, sums + COEFFICIENT)
     indices = _integer_array(options, sums + SUM_INDICES)
     for o in range(column.size):
@@ -219,10 +219,10 @@ def start_operations(options, table, values, z, x, y):
 
 @merged
 def _next_coefficients(options, table, K, values, z, x, y, x0, y0, total):
-    """Store the Taylor coefficients of order K > 0 of the results z of operations, and of their series x and y.
+    """Store the Taylor coefficients of order K > 0 of operations' results z, and of their auxiliary series x and y.
 
-    `table`, x, y: see `start_operations`. x0, y0: coefficients of order 0. `total`: result of `sum_of_products` for
-    order K. As coefficient K of the second factor of a PENDING product is not known yet, its term is left out.
+    `table`, x, y: see `start_operations`. x0, y0: order 0 of x and y. `total`: result of `sum_of_products` for order K.
+    In a PENDING product, the term with coefficient K of the second factor, which is not known yet, is left out.
     """
     groups = _integer_array(options, table + GROUPS)
     inverse = 1.0 / K
@@ -300,10 +300,10 @@ def array_views(options, memory, n, n_rows):
 
 @merged
 def start_series(options, t, unit, state, N, series, begin_early, x, y, r, c):
-    """Begin the Taylor series of a motion at t and `state`: store in N the coefficients that need no accelerations.
+    """Begin the series of a motion at t and `state`: store in the matrix N the coefficients that need no accelerations.
 
-    These are orders 0 and 1 of t and q, order 0 of v, and order 0 of the operations EARLY (series x and y, results in
-    N from column `begin_early`). `unit`: unit of time (s). Also set the right-hand sides r and c to zero.
+    These are orders 0 and 1 of t and q, and order 0 of v and of the operations EARLY. Results of EARLY begin at column
+    `begin_early` of N. x, y: see `start_operations`. `unit`: unit of time (s). Set the right-hand sides r, c to zero.
     """
     n = r.size
     r[:], c[:] = 0.0, 0.0
@@ -342,7 +342,7 @@ def compute_coefficients(f, w, options, memory, t, state, unit):
     """Compute the Taylor series about `state` at t, with the unit of time `unit` (s); return DONE or NOT_FINITE.
 
     The result overwrites the stored series with the index memory[TARGET]. The linear system of each order is solved
-    with the factors that w has from the accelerations at this state.
+    with the factors in w, which were computed for the accelerations at this state.
     """
     n, n_rows, order = w.Q.size, w.Rate.size, int(options[ORDER])
     N, X1, Y1, X2, Y2, total1, total2, r, c = array_views(options, memory, n, n_rows)
@@ -384,23 +384,23 @@ def compute_coefficients(f, w, options, memory, t, state, unit):
 
 # aim of the step sizes: (distance of the end of a step from the constraints, before projection) / (allowed distance)
 TARGET_PREDICTION_ERROR = 0.3
-# the defect at NEAR_BEGIN, near the beginning of a step, is due to rounding, because the series is exact there. A later
-# defect counts as rounding error if it is at most NOISE_RATIO times this, and at most MAX_NOISE * (allowed defect)
+# the series is exact near the beginning of a step: defects at k * NEAR_BEGIN (k = 1, 2, 3) are due to rounding. A later
+# defect is a rounding error if it is at most NOISE_RATIO * (largest of these) and at most MAX_NOISE * (allowed defect)
 MAX_NOISE, NOISE_RATIO = 1e4, 10.0
 NEAR_BEGIN = 1e-5  # time from the beginning of a step to a state where the series is exact, relative to the step size
 # the defect is checked at equidistant times within a step. At each attempt, these times shift by this fraction of their
-# spacing. Multiples of the golden section have evenly distributed fractional parts: so no time is missed for long
+# spacing. Multiples of the golden section have evenly distributed fractional parts: many attempts cover a step evenly
 GOLDEN_SECTION = 0.6180339887498949
-MAX_DEFECT = 1e300  # replaces an infinite defect: a callback had no finite value within the step, which is rejected
+MAX_DEFECT = 1e300  # replaces an infinite defect, which means that a callback had no finite value: the step is rejected
 MIN_FACTOR = 0.1  # smallest ratio of the next step size to the size of a step rejected because of its defect
 MAX_GROWTH = 5.0  # largest ratio of successive step sizes, because coefficients are scaled by the previous step size
 MAX_FIRST_FACTOR = 1e6  # largest ratio of the first step size to its guess, so that powers of the ratio do not overflow
-TOO_SHORT = 2.0  # the error of a first step much shorter than its series allows: above 1, so that the step is repeated
+TOO_SHORT = 2.0  # error returned for a first step much shorter than its series allows; above 1, so that it is repeated
 
 
 @merged
 def _compute_series(f, w, options, memory, t, state, unit, index):
-    """Compute the Taylor series about `state`, which was projected last; store it as series `index` (0 or 1)."""
+    """Compute the Taylor series about `state`, which was just projected, and store it as series `index` (0 or 1)."""
     n = w.Q.size
     memory[TARGET] = index
     if f.is_generated == 1 and w.used_general == 0.0:  # generated code has stored no factors in w: compute the factors
@@ -413,7 +413,7 @@ def _compute_series(f, w, options, memory, t, state, unit, index):
 
 @merged
 def _max_step(tolerances, series, unit, order, n):
-    """Return the largest step size, in units of `unit` (s), with the last two terms of `series` within tolerances."""
+    """Return the largest (step size) / `unit` (s) that keeps the last two terms of `series` within tolerances."""
     rtol, last, before = tolerances[RTOL], 0.0, 0.0
     row, row_before = order * n, (order - 1) * n
     for j in range(n):
@@ -556,7 +556,7 @@ def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
         was_near_singular = w.nearly_singular != 0.0  # True if the run is, or has been, near a singular position
         # near a singular position, check no defect: small violations of constraints by the series spoil accelerations
         checks_defect = w.near_now == 0.0
-        w.near_now = 0.0 if checks_defect else 2.0
+        w.near_now = 0.0 if checks_defect else 2.0  # 2 requests an update of w.pivot after the step
         ratio_to_gap = gap_ratio(tolerances, h)
         if ratio_to_gap > 0.0 and was_near_singular:
             return Attempt(DONE, ratio_to_gap, 1.0 / ratio_to_gap)

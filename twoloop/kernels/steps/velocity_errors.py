@@ -1,4 +1,4 @@
-"""Estimate the position errors that velocity errors cause, for methods whose steps are longer than vibrations.
+"""Estimate the position errors that velocity errors cause, if a method's steps are longer than vibration periods.
 
 A velocity error e changes the positions until e changes its sign or decays. This takes about sqrt(|e| / |J J e|), the
 duration of e. J is the Jacobian of the equations of motion (q, v)' = (v, F), where F are the accelerations. So an error
@@ -24,7 +24,7 @@ from twoloop.kernels.steps.stages import INNER_TOL, block, vector
 # a velocity error that changes as slowly as the motion is not due to a vibration. Such an error keeps its sign in later
 # steps, so that position errors add up. To allow for this, the error's duration is multiplied by up to this factor
 SLOW_FACTOR = 10.0
-LONGEST_GAPS = 10.0  # largest assumed duration of velocity errors / longest allowed time between evaluations
+LONGEST_GAPS = 10.0  # largest result of `motion_time` / longest allowed time between evaluations of the equations
 STEPS_TO_DECAY = 10.0  # number of steps after which fast components of a velocity error count as decayed
 FAST_DURATION = 20.0  # the duration of a velocity error is short if below this * z (step size * method's coefficient)
 OUTDATED_CHANGE = 0.3  # the Jacobian J of the equations of motion is outdated if its relative change exceeds this
@@ -59,7 +59,7 @@ def filtered_velocity_error(w, memory, tolerances, z, unfiltered, filtered_once,
 
 @compiled
 def velocity_error(w, tolerances, e_v, duration, state, new_state):
-    """Return the largest effect, in units of the tolerances, of a velocity error e_v (n_dof) that lasts `duration` (s).
+    """Return the largest effect on a coordinate, in tolerances, of a velocity error e_v (n_dof) lasting `duration` (s).
 
     The effect on a coordinate is the smaller one of two ratios: the velocity error to the velocity tolerance; and the
     position error, |e_v| times `duration`, to the position tolerance.
