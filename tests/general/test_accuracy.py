@@ -93,3 +93,17 @@ def test_a_stiff_model_in_millimetres_takes_about_as_many_evaluations_as_in_metr
         counts.append(result.stats.n_evaluations)
     np.testing.assert_allclose(*ends, rtol=0.0, atol=1e-6)
     assert counts[1] < 3 * counts[0]
+
+
+def test_points_in_millimetres_have_the_dependent_coordinates_of_metres():
+    system = pendulum(
+        n_q=4,
+        n_c=2,
+        gamma=False,
+        mass=lambda t, q: np.eye(4),
+        force=lambda t, q, v: np.array([0.0, -9810.0, 0.0, -9810.0]),
+        constraint=lambda t, q: np.array([q[0] ** 2 + q[1] ** 2 - 1e6, (q[2] - q[0]) ** 2 + (q[3] - q[1]) ** 2 - 1e6]),
+        jacobian=None,
+    )
+    result = solve_dae(system, (0.0, 1.0), [600.0, -800.0, 1200.0, -1600.0], np.zeros(4), "Gauss8", 1e-8, 1e-5)
+    assert result.success and result.stats.n_partitions == 1

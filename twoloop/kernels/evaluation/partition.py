@@ -36,7 +36,7 @@ from twoloop.kernels.linalg.markowitz_lu import (
     solve_rows,
 )
 
-LARGE_COLUMN = 16.0  # columns of the constraint Jacobian with larger entries are scaled when pivots are chosen
+LARGE_COLUMN = 16.0  # columns of angles with larger entries are scaled when pivots are chosen
 RANK_TOLERANCE = 1e-11  # a pivot, or the ratio of the smallest to the largest pivot, counts as zero up to this limit
 PARTITION_CHANGED = -1  # return code: the task succeeded, as for DONE, and the partition has changed
 MAX_ROWS_ELIMINATED = 200  # with more independent rows than this, `min_pivot_ratio` returns w.pivot to save time
@@ -55,18 +55,28 @@ def scale_rows(A):
                 A[i, j] *= scale
 
 
+@merged
+def _has_entry_one(row):
+    has_one = False
+    for entry in row:
+        has_one = has_one or abs(entry) == 1.0
+    return has_one
+
+
 @compiled
 def scale_large_columns(A):
-    """Scale columns of A in place by powers of two, where their largest entry exceeds LARGE_COLUMN; it becomes about 1.
+    """Scale columns of angles in A, which are large if lengths are in mm, by powers of two; largest entry: about 1.
 
-    Otherwise columns of angles would yield pivots only because lengths are in mm. Columns of small entries are not
+    Otherwise they would yield pivots because of their unit only. In a column of an angle, an entry exceeds LARGE_COLUMN
+    in a row that also has an entry of exactly 1 or -1, as in x - L cos(angle) = 0. Columns of small entries are not
     scaled, as entries become small near singular positions.
     """
     for j in range(A.shape[1]):
-        largest = 0.0
+        largest, is_angle = 0.0, False
         for i in range(A.shape[0]):
             largest = max(largest, abs(A[i, j]))
-        if largest > LARGE_COLUMN and largest < np.inf:
+            is_angle = is_angle or (abs(A[i, j]) > LARGE_COLUMN and _has_entry_one(A[i]))
+        if is_angle and largest < np.inf:
             scale = 2.0 ** -np.round(np.log2(largest))
             for i in range(A.shape[0]):
                 A[i, j] *= scale
