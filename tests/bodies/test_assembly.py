@@ -251,3 +251,10 @@ def test_velocities_of_light_bodies_do_not_depend_on_a_heavy_one_beside_them():
         return model.problem((0.0, 1.0)).v0
 
     np.testing.assert_allclose(start(1e8), start(1.0), rtol=1e-9, atol=1e-9)
+
+
+def test_given_velocities_that_are_rounding_errors_are_rest():
+    model = PlanarModel()
+    model.body("slider", mass=1.0, inertia=1.0, position=(1.0, 0.0), velocity=(0.0, 3e-17))
+    model.prismatic("ground", "slider", at=(1.0, 0.0), axis=(1.0, 0.0))
+    np.testing.assert_array_equal(model.problem((0.0, 1.0)).v0, 0.0)

@@ -22,6 +22,7 @@ from twoloop.run.projection import consistent_state, dependence, project_sparsel
 
 SINGULAR = 1e-9  # singular values of the scaled Jacobian below this fraction of the largest count as zero
 PERTURBATION = 0.02  # displacement, relative to max(1, |q|), at which the rank is determined a second time
+REST = 1e-14  # given velocities up to this, in sizes of the mechanism per second, are rounding errors of rest
 VELOCITY_CHANGE = 0.1  # largest change that the joints may require, relative to the largest given velocity
 ROUNDING = 8.0 * np.finfo(np.float64).eps  # rounding error of a constraint, relative to the sum of its |terms|
 FULL_RANK_RCOND = 1e-12  # C_q C_q^T has full rank if its reciprocal condition number exceeds this
@@ -116,7 +117,7 @@ def velocities(
         impulses = -mass @ (v * scales.columns)
         v = v + velocity_changes(mass, held, impulses[:, None], np.zeros((len(held), 1)))[:, 0] / scales.columns
     off = np.where(is_given, np.abs(v - target), 0.0)
-    if off.max(initial=0.0) > max(VELOCITY_CHANGE * size, SINGULAR * speed):
+    if off.max(initial=0.0) > max(VELOCITY_CHANGE * size, SINGULAR * speed, REST):
         j = int(off.argmax())
         name, unit = name_and_unit(coordinates[j])
         nearest = v[j] * scales.columns[j] if abs(v[j]) > ROUNDING * size else 0.0

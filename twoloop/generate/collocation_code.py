@@ -472,7 +472,7 @@ class CollocationCode:
         builder.position_at_end(after)
 
     def _load_iterated(self, emit: LaneEmitter, pointer: Value) -> list[Value]:
-        """Return values of all coordinates at the nodes: iterated ones are loaded from `pointer`, the others are 0."""
+        """Return values at the nodes, loaded from `pointer`; 0 for coordinates that accelerations do not depend on."""
         values = [emit.constant(0.0)] * self.n
         for k, i in enumerate(self.iterated_coordinates):
             values[i] = load_lanes(emit, pointer, LANES * k)

@@ -194,7 +194,7 @@ RUN_ARRAYS.add_function("advance", i8(KIT, WORK, *(VECTOR,) * 9, MATRIX, MATRIX,
     WEAK_LIMIT,  # M counts as singular if the ratio of its smallest to its largest eigenvalue is below this
     ADDED_SCALE,  # factor s: for a singular M, generated code uses M + s g^T g instead, where g are some rows of G
     CONTRADICTS,  # a start is refused if a residual of G a = gamma exceeds this times max(1, sum of |terms| in the row)
-    MASS_FLAG,  # flag that M must have, or the start is refused: DEFINITE, INDEFINITE; 0: M is constant, without a flag
+    MASS_FLAG,  # a start is refused unless M has this flag there: DEFINITE or INDEFINITE; 0: no flag, as M is constant
     LEAST_PIVOT,  # a start is refused if the smallest pivot of C_q at the start is below this
     EQUATION_FORM,  # initial f.form, the algebra that solves for accelerations
     FIRST_SIZE,  # first step size (s) chosen by the user; 0: `_first_step_size` computes it

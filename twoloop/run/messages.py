@@ -58,7 +58,7 @@ class StallDetector:
         self.longest_step = self.mean_step = 0.0
 
     def add_steps(self, h: Array) -> None:
-        """Add the sizes of accepted steps (s)."""
+        """Count accepted steps, and keep the size (s) of the longest step so far; `h`: sizes of the new steps."""
         self.longest_step = max(self.longest_step, float(h.max(initial=0.0)))
         self.window_n += len(h)
 
@@ -111,7 +111,7 @@ class StiffnessMonitor:
         self.samples: list[StiffnessSample] = []
 
     def add_steps(self, steps: Array) -> None:
-        """Add the sizes of accepted steps (s)."""
+        """Count accepted steps, and keep the sizes (s) of the last N_LAST_STEPS; `steps`: sizes of the new steps."""
         self.n_steps += steps.size
         last = steps[-N_LAST_STEPS:]
         self.last_sizes = last if last.size == N_LAST_STEPS else np.concatenate([self.last_sizes, last])[-N_LAST_STEPS:]

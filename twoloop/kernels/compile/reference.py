@@ -124,7 +124,7 @@ register_model(Reference)(models.OpaqueModel)
 
 @unbox(Reference)
 def _unbox(typ: Any, obj: Any, c: Any) -> NativeValue:
-    """Emit code that converts an argument, the Python object of a structure, to a pointer to its table.
+    """Emit code that converts a structure, passed as a Python object, to a pointer to its table of addresses and sizes.
 
     The argument has an attribute `address`, or is the address itself: passing an integer saves 0.1 microseconds.
     """

@@ -434,7 +434,8 @@ def _sample_ahead(f, w, tolerances, control, clock, next_change, t, size, last, 
     if may_resample and max_spacing < RESAMPLE_BELOW * clock[at.SAMPLED_EVERY]:
         clock[at.SAMPLED_TO] = t
     begin = max(t, clock[at.SAMPLED_TO])
-    is_at_change = clock[at.DISCONTINUITY] == clock[at.SAMPLED_TO]  # if so, the spacing of samples must not increase
+    # if the last samples ended at a sudden change, the next ones must not have a wider spacing than the last ones
+    is_at_change = clock[at.DISCONTINUITY] == clock[at.SAMPLED_TO]
     while begin < min(t + size, last, next_change):
         spacing, is_at_change = min(max_spacing, clock[at.SAMPLED_EVERY]) if is_at_change else max_spacing, False
         clock[at.WIDEST_SAMPLING] = max(clock[at.WIDEST_SAMPLING], spacing)

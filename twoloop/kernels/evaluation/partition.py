@@ -255,7 +255,7 @@ def write_programs(w):
 
 @compiled
 def _record_columns_of_entries(w):
-    """Store the columns of ones in w.pattern, row by row, in w.row_entries; row i begins at index w.row_entries[i]."""
+    """List in w.row_entries, for each row i of w.pattern, the columns where it is 1, from index w.row_entries[i] on."""
     n_rows = w.Rate.size
     index = n_rows + 1
     for i in range(n_rows):

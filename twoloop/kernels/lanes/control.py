@@ -245,7 +245,7 @@ def step_by_series(code, settings, control, options, work, status, n_steps, with
     code.compute_series(order, control, work)
     code.choose_sizes(order, control, work)
     _round_steps(work, control)
-    for k in range(LANES):  # X is step size / UNIT. Steps longer than GAP (s) require EVALUATED evaluations within them
+    for k in range(LANES):  # X: step size / UNIT. EVALUATED: number of evaluations of the equations within the step
         work[at.X * LANES + k] = work[at.H * LANES + k] / work[at.UNIT * LANES + k]
         if work[at.ACTIVE * LANES + k] == 1.0 and work[at.H * LANES + k] > control[at.GAP]:
             work[at.EVALUATED * LANES + k] = np.ceil(work[at.H * LANES + k] / control[at.GAP]) - 1.0

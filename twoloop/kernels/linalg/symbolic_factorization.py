@@ -53,7 +53,7 @@ class _DisjointSets:
 
 
 class _PartSupports:
-    """Record the supports of each part (set of connected bodies): the ground and hubs to which joints connect it."""
+    """Supports of each part (bodies connected by eliminated joints): the ground, and hubs (bodies with many joints)."""
 
     def __init__(self, joints: Sequence[frozenset[int]], n_bodies: int, hubs: set[int], lone_bodies: AbstractSet[int]):
         self.joints, self.hubs = joints, set(hubs)  # bodies of each joint; hubs that are not eliminated yet
