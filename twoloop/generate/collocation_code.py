@@ -256,7 +256,7 @@ class CollocationCode:
         return self._iterate(emit, work, state, tolerances, evaluate, fallback)
 
     def _mass_first_function(self, emit: LaneEmitter, kinds: list[str]) -> str:
-        """Return the name of an LLVM function for `iterate_step` that uses only the elimination beginning with M."""
+        """Return the name of a function, written once, that solves for stages by the elimination beginning with M."""
         module, name = emit.builder.module, "careful_nodes"
         if not module.defines(name):
             builder = module.function(name, DOUBLE, kinds, internal=True)

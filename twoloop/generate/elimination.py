@@ -55,10 +55,10 @@ MIN_PIVOTS = 10.0 ** np.arange(-2, -9, -1)  # possible PivotChoice.min_pivot; be
 # let p be the smallest relative pivot (see PIVOT_FRACTION) at a run's start. PivotChoice.min_pivot is MIN_PIVOTS[i]
 # for the first i with START_LIMITS[i] <= p, or MIN_PIVOTS[-1] if there is no such i
 START_LIMITS = MIN_PIVOTS[:-1] / PIVOT_FRACTION
-# M + s G^T G (s: scales of rows) is tried in place of M if PivotChoice.min_pivot would be MIN_PIVOTS[i] with i >= m.
-# With at most N_FEW_COORDINATES coordinates, m is MIN_INDEX_FEW or, if M is singular, MIN_INDEX_FEW_SINGULAR, because a
-# singular M (Euler parameters) costs two digits even in sound models. With more coordinates, M + s G^T G makes the code
-# much longer. Then m is MIN_INDEX_MANY or, if M is singular, MIN_INDEX_MANY + 1
+# M + s G^T G (s: scales of rows) is tried in place of M if PivotChoice.min_pivot with M is at most MIN_PIVOTS[m].
+# With at most N_FEW_COORDINATES coordinates, m is MIN_INDEX_FEW or, if M is singular (Euler parameters),
+# MIN_INDEX_FEW_SINGULAR, because pivots are then smaller even in sound models. With more coordinates, M + s G^T G makes
+# the code much longer: m is MIN_INDEX_MANY, and if M is singular, M + s G^T G is not tried
 N_FEW_COORDINATES = 24
 MIN_INDEX_FEW, MIN_INDEX_FEW_SINGULAR, MIN_INDEX_MANY = 4, 5, 6
 ADDED_SIZE = 16.0  # scales s are chosen so that the largest entry of s G^T G is about this * the largest entry of M

@@ -56,7 +56,7 @@ class Branch(NamedTuple):
 
 
 def branch_at(system: ConstrainedSystem, t: float, state: Array, rank: int, allowed: Array) -> Branch | bool | None:
-    """Return the Branch that leaves a singular start; None: the start is not singular; False: no branch is certain.
+    """Return the Branch that leaves a singular start; False: none was found with certainty; None: start not singular.
 
     `state`: [q, v, a] at the start; `rank`: rank of C_q at the start. The start counts as not singular if the rank does
     not rise along the motion, if C depends on t, or if non-holonomic constraints exist. The branch is not certain if

@@ -189,7 +189,7 @@ def _sine_to_independent_rows(f, w, row, square):
             x[columns[k]] += w.jacobian_values[k]
     solve_unknowns(f, w, 2)
     rows, columns, _ = mass_entries_of(f.ldl_program)
-    for k in range(rows.size):  # with the solution x, x^T M x is |component of row g orthogonal to independent rows|^2
+    for k in range(rows.size):  # x^T M x: squared norm, by M^-1, of g without its component along independent rows
         part += x[rows[k]] * w.mass_values[k] * x[columns[k]]
     return np.sqrt(part / square) if square > 0.0 else 0.0
 
@@ -264,7 +264,7 @@ def choose_rows(f, w, t, q):
 REGULARIZATION = 1e-11
 CONVERGED_RESIDUAL = 1e-14  # multipliers are refined until (error of reactions) / (largest reaction) is at most this
 MAX_RESIDUAL = 1e-9  # multipliers are rejected if (error of reactions) / (largest reaction) stays above this
-MAX_SOLUTIONS = 30  # largest number of refinements of the multipliers of least norm
+MAX_SOLUTIONS = 30  # most systems solved for multipliers of least norm: the first solution and its refinements
 
 
 @compiled

@@ -197,7 +197,7 @@ def newton_options(
 
 
 def _error_weights(b: NDArray[np.float64], c: NDArray[np.float64], gamma0: float) -> NDArray[np.float64]:
-    """Return the weights e (s) of the embedded error estimate h (gamma0 f(y_n) + sum_j e_j f(Y_j)) of a step.
+    """Return the s weights e of the embedded error estimate h (gamma0 f(y_n) + sum_j e_j f(Y_j)) of a step.
 
     f: right-hand side of y' = f(y). y_n: state at the beginning of the step. Y_j: stages. The estimate is the
     difference between an embedded quadrature of order s and the method with weights b and nodes c (Hairer & Wanner II,
