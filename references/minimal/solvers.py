@@ -19,7 +19,7 @@ from scipy.integrate import solve_ivp
 
 from references.cyrk import ode
 from references.driver import POSITIVE, Task, check_task, imported
-from references.equations.straight_line import Program, Value, machine_code
+from references.equations.straight_line import Program
 from references.heyoka import taylor
 from references.lines import CannotRun, Line
 from references.paper.four_bar_minimal import MinimalFourBar, absolute, tangent_of
@@ -374,11 +374,10 @@ def _integrator(equations: Minimal, tol: float) -> Any:
 @lru_cache(maxsize=64)
 def _right_hand_side(equations: Minimal, make: Callable[[Any, int], Any]) -> Any:
     """Return the right-hand side as `make` returns it for a solver of a compiled (t, y, rate) -> None."""
-    program, n = Program(), len(equations.start) // 2
-    names = [f"{letter}{i}" for letter in "qv" for i in range(n)]
+    n = len(equations.start)
+    program = Program(n // 2)
     functions = SimpleNamespace(**program.functions(FUNCTIONS))
-    rates = equations.equations(functions)([Value(program, name) for name in names])
-    return make(machine_code(n, program.names, enumerate(rate.name for rate in rates)), 2 * n)
+    return make(program.compiled(enumerate(equations.equations(functions)(program.inputs[1:]))), n)
 
 
 # in minimal coordinates, where these have a closed form: no solvers of a DAE, and in no ranking
