@@ -1,8 +1,8 @@
 """heyoka, CyRK and CVODE on a mechanism in minimal coordinates, where no constraints can drift.
 
 One or two angles with Lagrange's equations derived by hand, from the parameters of a problem only, for mechanisms whose
-loops close in closed form. Each equation is written once, for floats (`math`), compiled code (numba supports `math`),
-and expressions (heyoka has functions of the same names). The solvers have the options that are best in redundant
+loops close in closed form. Each equation is written once, for floats (`math`), values of straight-line code, and
+expressions (heyoka has functions of the same names). The solvers have the options that are best in redundant
 coordinates (`heyoka.taylor`, `cyrk.ode`, `sundials.cvode_c`), and the same timing of a second use of the integrator.
 """
 
@@ -29,7 +29,7 @@ from twoloop.mechanisms import Problem
 from twoloop.problem.problem import Array
 from twoloop.result.result import Result
 
-Equations = Callable[[Any], tuple[Any, ...]]  # [angles, rates] -> their rates
+Rates = tuple[Any, ...]  # of [angles, their rates]
 
 INSTANTS = 1000  # per half period, at which the distance from dead centres of a four-bar is determined
 NEAREST = 1e-2  # sine of the angle between the two other bars that counts as a dead centre
@@ -43,8 +43,8 @@ class NoMinimalCoordinates(CannotRun, ValueError):
 class Minimal:
     """A mechanism in minimal coordinates."""
 
-    # functions (`math` or another module with sin, cos, sqrt) -> rates, with rates(y) -> y', y = [angles, their rates]
-    equations: Callable[[Any], Equations]
+    # (functions, y) -> y' of y = [angles, their rates]; functions: `math`, or another module with sin, cos, sqrt
+    rates: Callable[[Any, Any], Rates]
     start: tuple[float, ...]  # initial y
     states: Callable[[Array], tuple[Array, Array]]  # y (2 n, n_t) -> q, v (n_q, n_t) in the problem's coordinates
 
@@ -74,15 +74,10 @@ def _pendulum(problem: Problem) -> Minimal:
     """One angle from the downward vertical: th'' = -g / L sin th."""
     pull = problem.parameters["gravity"] / problem.parameters["length"]
 
-    def equations(functions: Any) -> Equations:
-        sin = functions.sin
+    def rates(functions: Any, y: Any) -> Rates:
+        return y[1], -pull * functions.sin(y[0])
 
-        def rates(y):  # type: ignore[no-untyped-def]
-            return y[1], -pull * sin(y[0])
-
-        return rates
-
-    return _chain(problem, equations)
+    return _chain(problem, rates)
 
 
 def _double_pendulum(problem: Problem) -> Minimal:
@@ -93,22 +88,18 @@ def _double_pendulum(problem: Problem) -> Minimal:
     """
     pull = problem.parameters["gravity"] / problem.parameters["length"]
 
-    def equations(functions: Any) -> Equations:
+    def rates(functions: Any, y: Any) -> Rates:
         sin, cos = functions.sin, functions.cos
+        s, c = sin(y[0] - y[1]), cos(y[0] - y[1])
+        first = -s * (y[3] * y[3]) - 2.0 * pull * sin(y[0])
+        second = s * (y[2] * y[2]) - pull * sin(y[1])
+        determinant = 2.0 - c * c
+        return y[2], y[3], (first - c * second) / determinant, (2.0 * second - c * first) / determinant
 
-        def rates(y):  # type: ignore[no-untyped-def]
-            s, c = sin(y[0] - y[1]), cos(y[0] - y[1])
-            first = -s * (y[3] * y[3]) - 2.0 * pull * sin(y[0])
-            second = s * (y[2] * y[2]) - pull * sin(y[1])
-            determinant = 2.0 - c * c
-            return y[2], y[3], (first - c * second) / determinant, (2.0 * second - c * first) / determinant
-
-        return rates
-
-    return _chain(problem, equations)
+    return _chain(problem, rates)
 
 
-def _chain(problem: Problem, equations: Callable[[Any], Equations]) -> Minimal:
+def _chain(problem: Problem, equations: Callable[[Any, Any], Rates]) -> Minimal:
     """Return links of equal length in a chain from the origin, by their angles from the downward vertical."""
     length = problem.parameters["length"]
 
@@ -131,25 +122,21 @@ def _slider_crank(problem: Problem) -> Minimal:
     """
     a, J1, m2, J2, k, c, l0, F = (problem.parameters[name] for name in ("a", "J1", "m2", "J2", "k", "c", "l0", "F"))
 
-    def equations(functions: Any) -> Equations:
+    def rates(functions: Any, y: Any) -> Rates:
         sin, cos, sqrt = functions.sin, functions.cos, functions.sqrt
-
-        def rates(y):  # type: ignore[no-untyped-def]
-            s, w = sin(y[0]), y[1]
-            cc, s2 = cos(y[0]), -a * s
-            c2 = sqrt(1.0 - s2 * s2)
-            rod = -a * cc / c2  # first derivatives by the angle, of the rod angle and slider position; then second ones
-            slide = -s2 * rod - a * s
-            rod_2 = (s2 * (rod * rod) + a * s) / c2
-            slide_2 = -c2 * (rod * rod) - s2 * rod_2 - a * cc
-            length = 0.5 * (c2 + a * cc)
-            inertia = J1 + m2 * (slide * slide) + J2 * (rod * rod)
-            coupling = m2 * slide * slide_2 + J2 * rod * rod_2
-            spring = -0.5 * slide * (k * (length - l0) + 0.5 * c * slide * w)
-            push = F * (slide - s2 * rod)
-            return w, (spring + push - coupling * (w * w)) / inertia
-
-        return rates
+        s, w = sin(y[0]), y[1]
+        cc, s2 = cos(y[0]), -a * s
+        c2 = sqrt(1.0 - s2 * s2)
+        rod = -a * cc / c2  # first derivatives by the angle, of the rod angle and slider position; then second ones
+        slide = -s2 * rod - a * s
+        rod_2 = (s2 * (rod * rod) + a * s) / c2
+        slide_2 = -c2 * (rod * rod) - s2 * rod_2 - a * cc
+        length = 0.5 * (c2 + a * cc)
+        inertia = J1 + m2 * (slide * slide) + J2 * (rod * rod)
+        coupling = m2 * slide * slide_2 + J2 * rod * rod_2
+        spring = -0.5 * slide * (k * (length - l0) + 0.5 * c * slide * w)
+        push = F * (slide - s2 * rod)
+        return w, (spring + push - coupling * (w * w)) / inertia
 
     def states(y: Array) -> tuple[Array, Array]:
         s, cc = np.sin(y[0]), np.cos(y[0])
@@ -158,7 +145,7 @@ def _slider_crank(problem: Problem) -> Minimal:
         slide = -np.sin(tilt) * rod - a * s
         return np.array([y[0], np.cos(tilt) + a * cc, tilt]), y[1] * np.array([np.ones_like(s), slide, rod])
 
-    return Minimal(equations, (float(problem.q0[0]), float(problem.v0[0])), states)
+    return Minimal(rates, (float(problem.q0[0]), float(problem.v0[0])), states)
 
 
 def _four_bar(problem: Problem) -> Minimal:
@@ -181,46 +168,36 @@ def _four_bar(problem: Problem) -> Minimal:
     masses = [density * length for length in lengths]
     # centre of bar i = sum of HALVES[i] L e; factors of the three bars in the order k, a, b
     arms = [[masses[i], *(HALVES[i][j] * lengths[j] for j in (bar, a, b))] for i in range(3)]
-    (m1, k1, a1, b1), (m2, k2, a2, b2), (m3, k3, a3, b3) = arms
     Jk, Ja, Jb = (masses[i] * lengths[i] ** 2 / 12.0 for i in (bar, a, b))
 
-    def equations(functions: Any) -> Equations:
+    def rates(functions: Any, y: Any) -> Rates:
         sin, cos, sqrt = functions.sin, functions.cos, functions.sqrt
-
-        def rates(y):  # type: ignore[no-untyped-def]
-            ck, sk, w = cos(y[0]), sin(y[0]), y[1]
-            x, z = ground - Lk * ck, -Lk * sk
-            square = x * x + z * z
-            parallel = 0.5 * (square + (La * La - Lb * Lb)) / square
-            normal = side * sqrt(La * La / square - parallel * parallel)
-            ax, az = parallel * x - normal * z, parallel * z + normal * x
-            ca, sa, cb, sb = ax / La, az / La, (x - ax) / Lb, (z - az) / Lb
-            sine = sb * ca - cb * sa
-            # derivatives of the two angles by the independent one: first and second, from the loop closure
-            na = -Lk * (sb * ck - cb * sk) / (La * sine)
-            nb = Lk * (sa * ck - ca * sk) / (Lb * sine)
-            ra, rb = na * na, nb * nb
-            wx, wz = Lk * ck + La * ra * ca + Lb * rb * cb, Lk * sk + La * ra * sa + Lb * rb * sb
-            da, db = (wx * cb + wz * sb) / (La * sine), -(wx * ca + wz * sa) / (Lb * sine)
-            # first and second derivatives of the bars' vectors e
-            kx, kz, ax, az, bx, bz = -sk, ck, -sa * na, ca * na, -sb * nb, cb * nb
-            kxx, kzz = -ck, -sk
-            axx, azz = -ca * ra - sa * da, -sa * ra + ca * da
-            bxx, bzz = -cb * rb - sb * db, -sb * rb + cb * db
-            # and of the centres
-            x1, z1 = k1 * kx + a1 * ax + b1 * bx, k1 * kz + a1 * az + b1 * bz
-            x2, z2 = k2 * kx + a2 * ax + b2 * bx, k2 * kz + a2 * az + b2 * bz
-            x3, z3 = k3 * kx + a3 * ax + b3 * bx, k3 * kz + a3 * az + b3 * bz
-            inertia = Jk + Ja * ra + Jb * rb
-            inertia = inertia + m1 * (x1 * x1 + z1 * z1) + m2 * (x2 * x2 + z2 * z2) + m3 * (x3 * x3 + z3 * z3)
-            coupling = Ja * na * da + Jb * nb * db
-            coupling = coupling + m1 * (x1 * (k1 * kxx + a1 * axx + b1 * bxx) + z1 * (k1 * kzz + a1 * azz + b1 * bzz))
-            coupling = coupling + m2 * (x2 * (k2 * kxx + a2 * axx + b2 * bxx) + z2 * (k2 * kzz + a2 * azz + b2 * bzz))
-            coupling = coupling + m3 * (x3 * (k3 * kxx + a3 * axx + b3 * bxx) + z3 * (k3 * kzz + a3 * azz + b3 * bzz))
-            weight = gravity * (m1 * z1 + m2 * z2 + m3 * z3)
-            return w, -(weight + coupling * (w * w)) / inertia
-
-        return rates
+        ck, sk, w = cos(y[0]), sin(y[0]), y[1]
+        x, z = ground - Lk * ck, -Lk * sk
+        square = x * x + z * z
+        parallel = 0.5 * (square + (La * La - Lb * Lb)) / square
+        normal = side * sqrt(La * La / square - parallel * parallel)
+        ax, az = parallel * x - normal * z, parallel * z + normal * x
+        ca, sa, cb, sb = ax / La, az / La, (x - ax) / Lb, (z - az) / Lb
+        sine = sb * ca - cb * sa
+        # derivatives of the two angles by the independent one: first and second, from the loop closure
+        na = -Lk * (sb * ck - cb * sk) / (La * sine)
+        nb = Lk * (sa * ck - ca * sk) / (Lb * sine)
+        ra, rb = na * na, nb * nb
+        wx, wz = Lk * ck + La * ra * ca + Lb * rb * cb, Lk * sk + La * ra * sa + Lb * rb * sb
+        da, db = (wx * cb + wz * sb) / (La * sine), -(wx * ca + wz * sa) / (Lb * sine)
+        # first and second derivatives of the bars' vectors e
+        kx, kz, ax, az, bx, bz = -sk, ck, -sa * na, ca * na, -sb * nb, cb * nb
+        kxx, kzz = -ck, -sk
+        axx, azz = -ca * ra - sa * da, -sa * ra + ca * da
+        bxx, bzz = -cb * rb - sb * db, -sb * rb + cb * db
+        inertia, coupling, weight = Jk + Ja * ra + Jb * rb, Ja * na * da + Jb * nb * db, 0.0
+        for m, k, a, b in arms:  # and of the centres
+            dx, dz = k * kx + a * ax + b * bx, k * kz + a * az + b * bz
+            inertia = inertia + m * (dx * dx + dz * dz)
+            coupling = coupling + m * (dx * (k * kxx + a * axx + b * bxx) + dz * (k * kzz + a * azz + b * bzz))
+            weight = weight + gravity * m * dz
+        return w, -(weight + coupling * (w * w)) / inertia
 
     def turns(angle: Array) -> dict[int, Array]:
         """Return the three angles, continuous in the independent one: R rotates only if its bar exceeds the ground."""
@@ -241,7 +218,7 @@ def _four_bar(problem: Problem) -> Minimal:
         tangent = tangent_of(np.array(lengths), angles)
         return absolute(np.array(lengths), angles, tangent / tangent[bar] * y[1])
 
-    return Minimal(equations, (float(problem.q0[3 * bar + 2]), float(problem.v0[3 * bar + 2])), states)
+    return Minimal(rates, (float(problem.q0[3 * bar + 2]), float(problem.v0[3 * bar + 2])), states)
 
 
 def _n_four_bar(problem: Problem) -> Minimal:
@@ -255,13 +232,8 @@ def _n_four_bar(problem: Problem) -> Minimal:
     by_tips = len(problem.q0) == 2 * (n + 1)
     crank = 1.0 if by_tips else 0.5  # of its length, to the point whose coordinates are q
 
-    def equations(functions: Any) -> Equations:
-        cos = functions.cos
-
-        def rates(y):  # type: ignore[no-untyped-def]
-            return y[1], -pull * cos(y[0])
-
-        return rates
+    def rates(functions: Any, y: Any) -> Rates:
+        return y[1], -pull * functions.cos(y[0])
 
     def states(y: Array) -> tuple[Array, Array]:
         arm, turned = length * np.exp(1j * y[0]), y[1] * 1j * length * np.exp(1j * y[0])
@@ -276,7 +248,7 @@ def _n_four_bar(problem: Problem) -> Minimal:
 
     tip, speed = problem.q0[:2] / (crank * length), problem.v0[:2] / (crank * length)
     angle = math.atan2(tip[1], tip[0]) if by_tips else float(problem.q0[2])  # with whole turns
-    return Minimal(equations, (angle, float(tip[0] * speed[1] - tip[1] * speed[0])), states)
+    return Minimal(rates, (angle, float(tip[0] * speed[1] - tip[1] * speed[0])), states)
 
 
 def minimal_motion(problem: Problem, t_end: float) -> tuple[Callable[[Array], tuple[Array, Array]], float]:
@@ -285,10 +257,10 @@ def minimal_motion(problem: Problem, t_end: float) -> tuple[Callable[[Array], tu
     Raises NoMinimalCoordinates as `minimal`.
     """
     equations = minimal(problem)
-    rates, times = equations.equations(math), np.linspace(0.0, t_end, 1 + 3 * INSTANTS)
+    times = np.linspace(0.0, t_end, 1 + 3 * INSTANTS)
     options: dict[str, Any] = {"rtol": 1e-13, "atol": 1e-13, "dense_output": True, "max_step": t_end / INSTANTS}
     solutions = [
-        solve_ivp(lambda t, y: rates(y), (0.0, t_end), equations.start, method=method, **options).sol
+        solve_ivp(lambda t, y: equations.rates(math, y), (0.0, t_end), equations.start, method=method, **options).sol
         for method in ("DOP853", "LSODA")
     ]
     q, other = (equations.states(solution(times))[0] for solution in solutions)
@@ -367,7 +339,7 @@ def solve_cyrk_minimal(
 def _integrator(equations: Minimal, tol: float) -> Any:
     package = imported("heyoka")
     symbols = package.make_vars(*(f"y{i}" for i in range(len(equations.start))))
-    motion = list(zip(symbols, equations.equations(package)(symbols), strict=True))
+    motion = list(zip(symbols, equations.rates(package, symbols), strict=True))
     return taylor.build_integrator(motion, list(equations.start), 0.0, tol, unrolled=True)
 
 
@@ -377,7 +349,7 @@ def _right_hand_side(equations: Minimal, make: Callable[[Any, int], Any]) -> Any
     n = len(equations.start)
     program = Program(n // 2)
     functions = SimpleNamespace(**program.functions(FUNCTIONS))
-    return make(program.compiled(enumerate(equations.equations(functions)(program.inputs[1:]))), n)
+    return make(program.compiled(enumerate(equations.rates(functions, program.inputs[1:]))), n)
 
 
 # in minimal coordinates, where these have a closed form: no solvers of a DAE, and in no ranking

@@ -81,8 +81,7 @@ SOLVERS = {
 
 def motion(problem, t_end):
     own = minimal(problem)
-    rates = own.equations(math)
-    made = solve_ivp(lambda t, y: rates(y), (0.0, t_end), own.start, "DOP853", rtol=1e-13, atol=1e-14)
+    made = solve_ivp(lambda t, y: own.rates(math, y), (0.0, t_end), own.start, "DOP853", rtol=1e-13, atol=1e-14)
     return made.t, *own.states(made.y)
 
 
