@@ -160,24 +160,14 @@ def _force(
         pin.computeJointJacobians(model, data, q)
         tau = np.zeros(model.nv)
 
-        def rows(body: int) -> Array:
-            frame = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
-            return np.asarray(pin.getJointJacobian(model, data, frames[body][0], frame))
+        def jacobian(body: int, point: Array) -> Array:
+            """Return how a point of a body moves, above how the body turns (6, n_v), in the axes of space."""
+            joint = frames[body][0]
+            J = pin.getJointJacobian(model, data, joint, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED).reshape(6, -1)
+            return np.vstack([J[:3] - pin.skew(point - data.oMi[joint].translation) @ J[3:], J[3:]])
 
-        def pull(body: int, point: Array, f: Array, torque: Array) -> None:
-            if joint := frames[body][0]:
-                J = rows(body)
-                tau[:] += J[:3].T @ f + J[3:].T @ (np.cross(point - data.oMi[joint].translation, f) + torque)
-
-        def speed(body: int, point: Array, v: Array) -> Array:
-            if not (joint := frames[body][0]):
-                return np.zeros(3)
-            twist = rows(body) @ v
-            return np.asarray(twist[:3] + np.cross(twist[3:], point - data.oMi[joint].translation))
-
-        zero = np.zeros(3)
         for k in turning:
-            pull(int(k), zero, zero, rigid.torques[k])
+            tau += jacobian(int(k), np.zeros(3))[3:].T @ rigid.torques[k]
         for a, on_a, b, on_b, (stiffness, damping, length) in springs:
             ends = [
                 (data.oMi[joint] * origin).act(point)
@@ -185,10 +175,9 @@ def _force(
             ]
             direction = ends[1] - ends[0]
             long = float(np.linalg.norm(direction))
-            rate = damping and direction @ (speed(b.number, ends[1], v) - speed(a.number, ends[0], v)) / long
-            f = (stiffness * (long - length) + damping * rate) / long * direction
-            pull(a.number, ends[0], f, zero)
-            pull(b.number, ends[1], -f, zero)
+            J = jacobian(b.number, ends[1])[:3] - jacobian(a.number, ends[0])[:3]
+            rate = damping and direction @ (J @ v) / long
+            tau -= J.T @ ((stiffness * (long - length) + damping * rate) / long * direction)
         return tau
 
     return force

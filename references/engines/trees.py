@@ -37,16 +37,22 @@ def _outwards(bodies: PlanarBodies) -> Iterator[tuple[int, Array, int, Array]]:
         stack += [(body, pin_in_child, child) for child in hanging.get(body, ())]
 
 
-def _in_space(parents: list[tuple[int, int]], relative: Array) -> Array:
+def _parents(bodies: PlanarBodies) -> dict[int, int]:
+    """Return the parent of each body, in the same order."""
+    return {body: on for body, _, on, _ in _outwards(bodies)}
+
+
+def _in_space(parents: dict[int, int], relative: Array) -> Array:
     """Return sums of joint quantities from the ground to each body."""
-    sums = np.zeros(len(relative))
-    for body, on in parents:
-        sums[body] = relative[body] + (0.0 if on == GROUND else sums[on])
-    return sums
+    sums = np.append(relative, 0.0)  # of the ground, which has the index of the last
+    for body, on in parents.items():
+        sums[body] += sums[on]
+    return sums[:-1]
 
 
-def _relative(values: Array, body: int, on: int) -> float:
-    return float(values[body] - (0.0 if on == GROUND else values[on]))
+def _in_joints(parents: dict[int, int], values: Array) -> Array:
+    """Return how much quantities of bodies differ from those of their parents."""
+    return values - np.append(values, 0.0)[[parents[body] for body in range(len(values))]]
 
 
 def mujoco_tree(bodies: PlanarBodies, angles: Array, rates: Array) -> TreeDynamics:
@@ -54,44 +60,34 @@ def mujoco_tree(bodies: PlanarBodies, angles: Array, rates: Array) -> TreeDynami
 
     Raises RuntimeError if MuJoCo is not installed.
     """
-    mujoco = imported("mujoco", extra="engines")
+    mujoco, parents = imported("mujoco", extra="engines"), _parents(bodies)
     spec = mujoco.MjSpec()
     spec.option.gravity = [0.0, -bodies.gravity, 0.0]
-    elements, parents, speeds = {GROUND: spec.worldbody}, [], []
+    elements, halves = {GROUND: spec.worldbody}, 0.5 * _in_joints(parents, angles)
     for body, centre, on, pin in _outwards(bodies):
-        half = 0.5 * _relative(angles, body, on)
         mass = {"mass": bodies.masses[body], "inertia": bodies.inertias[body] * MOMENTS, "explicitinertial": True}
-        turned = [np.cos(half), 0.0, 0.0, np.sin(half)]
+        turned = [np.cos(halves[body]), 0.0, 0.0, np.sin(halves[body])]
         elements[body] = elements[on].add_body(name=str(body), pos=pin, quat=turned, ipos=centre, **mass)
         elements[body].add_joint(type=mujoco.mjtJoint.mjJNT_HINGE, axis=Z)
-        parents.append((body, on))
-        speeds.append(_relative(rates, body, on))
     model = spec.compile()
     data = mujoco.MjData(model)
     first = [model.body(str(body)).dofadr[0] for body in range(len(angles))]
-    data.qvel[[first[body] for body, _ in parents]] = speeds
+    data.qvel[first] = _in_joints(parents, rates)
     return TreeDynamics(lambda: mujoco.mj_forward(model, data), lambda: _in_space(parents, data.qacc[first]))
 
 
-class _Pinocchio(NamedTuple):
-    pin: Any
-    model: Any
-    first: list[int]  # index of the joint coordinate of each body
-    parents: list[tuple[int, int]]
-
-
-def _in_pinocchio(bodies: PlanarBodies) -> _Pinocchio:
+def _in_pinocchio(bodies: PlanarBodies) -> tuple[Any, Any, list[int]]:
+    """Return the package, the model, and the index of the joint coordinate of each body."""
     package = imported("pinocchio", "pin", extra="engines")
     model = package.Model()
     model.gravity = package.Motion(np.array([0.0, -bodies.gravity, 0.0]), np.zeros(3))
-    joints, parents = {GROUND: 0}, []
+    joints = {GROUND: 0}
     for body, centre, on, pin in _outwards(bodies):
         place = package.SE3(np.eye(3), pin)
         joints[body] = model.addJoint(joints[on], package.JointModelRZ(), place, str(body))
         inertia = package.Inertia(float(bodies.masses[body]), centre, np.diag(bodies.inertias[body] * MOMENTS))
         model.appendBodyToJoint(joints[body], inertia, package.SE3.Identity())
-        parents.append((body, on))
-    return _Pinocchio(package, model, [model.joints[joints[body]].idx_v for body in range(len(bodies.masses))], parents)
+    return package, model, [model.joints[joints[body]].idx_v for body in range(len(bodies.masses))]
 
 
 def pinocchio_tree(bodies: PlanarBodies, angles: Array, rates: Array) -> TreeDynamics:
@@ -99,10 +95,9 @@ def pinocchio_tree(bodies: PlanarBodies, angles: Array, rates: Array) -> TreeDyn
 
     Raises RuntimeError if Pinocchio is not installed.
     """
-    pin, model, first, parents = _in_pinocchio(bodies)
+    (pin, model, first), parents = _in_pinocchio(bodies), _parents(bodies)
     data, q, v, tau = model.createData(), *np.zeros((3, model.nv))
-    for body, on in parents:
-        q[first[body]], v[first[body]] = _relative(angles, body, on), _relative(rates, body, on)
+    q[first], v[first] = _in_joints(parents, angles), _in_joints(parents, rates)
     return TreeDynamics(lambda: pin.aba(model, data, q, v, tau), lambda: _in_space(parents, data.ddq[first]))
 
 
@@ -111,27 +106,21 @@ def end_by_pinocchio(bodies: PlanarBodies, angles: Array, t_end: float, toleranc
 
     Raises RuntimeError if Pinocchio is not installed.
     """
-    pin, model, first, parents = _in_pinocchio(bodies)
+    (pin, model, first), parents = _in_pinocchio(bodies), _parents(bodies)
     data, y0, tau = model.createData(), np.zeros(2 * model.nv), np.zeros(model.nv)
-    for body, on in parents:
-        y0[first[body]] = _relative(angles, body, on)
+    y0[first] = _in_joints(parents, angles)
 
     def rate(t: float, y: Array) -> Array:
         q, v = np.split(y, 2)
         return np.concatenate([v, pin.aba(model, data, q, v, tau)])
 
     options = {"rtol": tolerance, "atol": tolerance, "method": "DOP853"}
-    ends = _in_space(parents, solve_ivp(rate, (0.0, t_end), y0, t_eval=(t_end,), **options).y[first, 0])
-    pins, coordinates = {GROUND: np.zeros(2)}, np.zeros((len(angles), 3))
-    for body, centre, on, pin_ in _outwards(bodies):
-        pins[body] = pins[on] + _turned(0.0 if on == GROUND else ends[on], pin_)
-        coordinates[body] = *(pins[body] + _turned(ends[body], centre)), ends[body]
+    q = solve_ivp(rate, (0.0, t_end), y0, t_eval=(t_end,), **options).y[: model.nv, 0]
+    pin.forwardKinematics(model, data, q)
+    coordinates = np.column_stack([np.zeros((len(angles), 2)), _in_space(parents, q[first])])
+    for body, centre, *_ in _outwards(bodies):
+        coordinates[body, :2] = data.oMi[model.getJointId(str(body))].act(centre)[:2]
     return coordinates.ravel()
-
-
-def _turned(angle: float, place: Array) -> Array:
-    c, s = np.cos(angle), np.sin(angle)
-    return np.array([c * place[0] - s * place[1], s * place[0] + c * place[1]])
 
 
 ENGINES = {"MuJoCo": mujoco_tree, "Pinocchio": pinocchio_tree}

@@ -185,11 +185,10 @@ def solve_ida_c(
         absolute[system.n_q * (2 if error_test == "states" else 1) :] = NOT_TESTED
     if banded and system.bandwidth is None:
         raise ValueError(f"banded=True needs a system with a bandwidth; {system.name!r} declares none")
-    band, size = band_of(form) if banded else None, absolute.size
-    order = np.arange(size) if band is None else band.order
-    widths = None if band is None else (band.lower, band.upper)
+    size = absolute.size
+    order, widths = band_of(form) if banded else (np.arange(size), None)
     residual, jacobian = _compiled(form.parts, system.n_q, system.n_c, system.functions.p.size, widths)
-    room = () if band is None else (order.astype(float), np.zeros(3 * size + size * size))
+    room = () if widths is None else (order.astype(float), np.zeros(3 * size + size * size))
     data = np.concatenate([array.ravel() for array in (*form.space, *room)])
 
     def set_up(solver: Memory) -> None:
