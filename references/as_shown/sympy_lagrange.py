@@ -51,10 +51,6 @@ def _lagrange(problem: KnownProblem) -> Callable[..., tuple[Array, Array]]:
     method = mechanics.LagrangesMethod(kinetic - potential, q, hol_coneqs=rods)
     method.form_lagranges_equations()
     plain = sympy.symbols(f"p:{2 * problem.n_q}")
-    names = dict(
-        zip(
-            [*(coordinate.diff(t) for coordinate in q), *q], [*plain[problem.n_q :], *plain[: problem.n_q]], strict=True
-        )
-    )
+    names = dict(zip([*q, *(x.diff(t) for x in q)], plain, strict=True))
     parts = [part.subs(names) for part in (method.mass_matrix_full, method.forcing_full)]
     return sympy.lambdify(plain, parts)  # type: ignore[no-any-return]

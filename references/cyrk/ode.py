@@ -177,11 +177,9 @@ class Solver:
         longest: float,
     ):
         self.task, self.start, self.longest = task, np.array(start, dtype=float), longest
-        self.rate, self.jacobian = (None if tolerance is None else tolerance.address for tolerance in functions)
-        self.tolerances, self.arguments = (
-            [np.array([tolerance]) for tolerance in tolerances],
-            np.zeros(1, dtype=np.int64),
-        )
+        self.rate, self.jacobian = (None if function is None else function.address for function in functions)
+        self.tolerances = [np.array([tolerance]) for tolerance in tolerances]
+        self.arguments = np.zeros(1, dtype=np.int64)
         create, self._solve = library()
         self.pointer = POINTER()
         soon = task.t0 + 1e-9 * (task.t1 - task.t0)  # is made, and initialised, by a run

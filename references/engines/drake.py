@@ -44,13 +44,10 @@ def prepare(rigid: Rigid, settings: Settings = Settings()) -> Prepared:  # noqa:
         context = simulator.get_mutable_context()
         _start(rigid, plant, context, bodies)
         simulator.Initialize()
-        done = 0
 
-        def step(n: int) -> str:
-            nonlocal done
-            done += n
+        def step(n: int, t: float) -> str:
             try:
-                simulator.AdvanceTo(done * h)
+                simulator.AdvanceTo(t)
             except RuntimeError as error:
                 return str(error).strip().splitlines()[0]
             return ""
@@ -58,14 +55,12 @@ def prepare(rigid: Rigid, settings: Settings = Settings()) -> Prepared:  # noqa:
         def see() -> State:
             poses = [plant.EvalBodyPoseInWorld(context, body) for body in bodies]
             twists = [plant.EvalBodySpatialVelocityInWorld(context, body) for body in bodies]
-            x = np.array([inertia.translation() for inertia in poses])
-            R = np.array([inertia.rotation().matrix() for inertia in poses])
-            v, w = (
-                np.array([getattr(inertia, part)() for inertia in twists]) for part in ("translational", "rotational")
-            )
-            return done * h, x, R, v, w, _force(rigid, plant, context, bodies)
+            x = np.array([pose.translation() for pose in poses])
+            R = np.array([pose.rotation().matrix() for pose in poses])
+            v, w = (np.array([getattr(each, part)() for each in twists]) for part in ("translational", "rotational"))
+            return x, R, v, w, _force(rigid, plant, context, bodies)
 
-        return parts.march(began, n_steps, n_stored, see, step)
+        return parts.march(began, h, n_steps, n_stored, see, step)
 
     _, bodies = _plant(rigid, settings, 1e-3)
     if refused := run(1e-6, 1, 1).message:

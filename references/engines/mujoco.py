@@ -36,7 +36,7 @@ def prepare(rigid: Rigid, settings: Settings = Settings()) -> Prepared:  # noqa:
 
     def run(t_end: float, n_steps: int, n_stored: int) -> Motion:
         began = time.process_time()
-        model.opt.timestep = t_end / n_steps
+        model.opt.timestep = h = t_end / n_steps
         data = mujoco.MjData(model)
         data.xfrc_applied[bodies, 3:] = rigid.torques
         for body in rigid.model.bodies:
@@ -46,7 +46,7 @@ def prepare(rigid: Rigid, settings: Settings = Settings()) -> Prepared:  # noqa:
                 width = 3 if kind == BALL else 1
                 data.qvel[first : first + width] = rates[number : number + width]
 
-        def step(n: int) -> str:
+        def step(n: int, t: float) -> str:
             mujoco.mj_step(model, data, nstep=n)
             numbers = data.warning.number
             return f"MuJoCo warns of {mujoco.mjtWarning(int(numbers.argmax())).name}" if numbers.any() else ""
@@ -59,12 +59,11 @@ def prepare(rigid: Rigid, settings: Settings = Settings()) -> Prepared:  # noqa:
             for row, body in zip(twists, bodies, strict=True):
                 mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_BODY, body, row, 0)
             poses = data.xpos[bodies].copy(), data.xmat[bodies].reshape(-1, 3, 3).copy()
-            state = data.time, *poses, twists[:, 3:], twists[:, :3]
             mujoco.mj_forward(model, data)  # without this, forces are those of the previous step
             connected = (data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY) & np.isin(data.efc_id, connects)
-            return *state, data.efc_force[connected].reshape(-1, 3).sum(axis=0)
+            return *poses, twists[:, 3:], twists[:, :3], data.efc_force[connected].reshape(-1, 3).sum(axis=0)
 
-        return march(began, n_steps, n_stored, see, step)
+        return march(began, h, n_steps, n_stored, see, step)
 
     return Prepared(model.body_mass[bodies], model.body_inertia[bodies].max(axis=1), run)
 

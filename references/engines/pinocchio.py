@@ -62,12 +62,10 @@ def prepare(rigid: Rigid, settings: Settings = Settings()) -> Prepared:  # noqa:
         def acceleration(q: Array, v: Array) -> Array:
             return np.asarray(pin.constraintDynamics(model, data, q, v, force(q, v), constraints, datas, proximal))
 
-        q, v = pin.neutral(model), _start(rigid, frames, model)
-        done = 0
-        rate = _rates(model)
+        q, v, rate = pin.neutral(model), _start(rigid, frames, model), _rates(model)
 
-        def step(n: int) -> str:
-            nonlocal q, v, done
+        def step(n: int, t: float) -> str:
+            nonlocal q, v
             for _ in range(n):
                 if settings.integrator == "Euler":
                     v = v + h * acceleration(q, v)
@@ -77,16 +75,13 @@ def prepare(rigid: Rigid, settings: Settings = Settings()) -> Prepared:  # noqa:
                     q = pin.normalize(model, q)
                 if not np.isfinite(v).all():
                     return "the accelerations are not finite"
-            done += n
             return ""
 
         def see() -> State:
             pin.forwardKinematics(model, data, q, v)
-            poses, twists = [], []
-            for k in range(len(rigid.x)):
-                joint, origin = frames[k]
-                poses.append(data.oMi[joint] * origin)
-                twists.append(origin.actInv(data.v[joint]))
+            own = [frames[k] for k in range(len(rigid.x))]
+            poses = [data.oMi[joint] * origin for joint, origin in own]
+            twists = [origin.actInv(data.v[joint]) for joint, origin in own]
             x, R = np.array([item.translation for item in poses]), np.array([item.rotation for item in poses])
             speeds, spins = (
                 np.array([pose.rotation @ getattr(twist, part) for pose, twist in zip(poses, twists, strict=True)])
@@ -97,9 +92,9 @@ def prepare(rigid: Rigid, settings: Settings = Settings()) -> Prepared:  # noqa:
                 acceleration(q, v)
                 turned = data.oMi[constraints[0].joint1_id].rotation @ constraints[0].joint1_placement.rotation
                 f = turned @ np.sum([item.contact_force.linear for item in list(datas)[:n_points]], axis=0)
-            return done * h, x, R, speeds, spins, f
+            return x, R, speeds, spins, f
 
-        return parts.march(began, n_steps, n_stored, see, step)
+        return parts.march(began, h, n_steps, n_stored, see, step)
 
     inertias = [model.inertias[frames[k][0]] for k in range(len(rigid.x))]
     moments = [float(np.linalg.eigvalsh(item.inertia)[-1]) for item in inertias]

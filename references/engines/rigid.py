@@ -55,30 +55,32 @@ class Prepared:
     run: Callable[[float, int, int], Motion]  # run(t_end, n_steps, n_stored) -> Motion, from the start
 
 
-State = tuple[float, Array, Array, Array, Array, Array]  # t, x, R, v, w, f of `Motion` at one instant
+State = tuple[Array, Array, Array, Array, Array]  # x, R, v, w, f of `Motion` at one instant
 NOT_REPORTED = np.full(3, np.nan)
 
 
-def march(began: float, n_steps: int, n_stored: int, see: Callable[[], State], step: Callable[[int], str]) -> Motion:
-    """Return the motion of an engine set up since `began`; step(n) takes n steps and returns an error message or "".
+def march(
+    began: float, h: float, n_steps: int, n_stored: int, see: Callable[[], State], step: Callable[[int, float], str]
+) -> Motion:
+    """Return the motion of an engine set up since `began`; step(n, t) takes n steps, to t, and returns "" or an error.
 
     States are stored at the start and after whole steps at n_stored roughly equidistant times.
     """
     stored, spent, message = [see()], 0.0, ""
     ends = np.unique(np.round(np.linspace(0, n_steps, n_stored + 1)).astype(int))
-    for n in np.diff(ends):
+    for n, end in zip(np.diff(ends).tolist(), ends[1:].tolist(), strict=True):
         start = time.process_time()
-        message = step(int(n))
+        message = step(n, end * h)
         spent += time.process_time() - start
         state = see()
         if not message and not all(np.isfinite(values).all() for values in state[:-1]):
             message = "the state is not finite"
         if message:
-            message = f"at {state[0]:.3g} s or before: {message}"
+            message = f"at {end * h:.3g} s or before: {message}"
             break
         stored.append(state)
-    t, x, R, v, w, f = (np.array(values) for values in zip(*stored, strict=True))
-    return Motion(t, x, R, v, w, f, time.process_time() - began, spent, message)
+    x, R, v, w, f = (np.array(values) for values in zip(*stored, strict=True))
+    return Motion(ends[: len(x)] * h, x, R, v, w, f, time.process_time() - began, spent, message)
 
 
 @dataclass(frozen=True)

@@ -88,7 +88,7 @@ def run(
 ) -> Result:
     """Solve an assembled system whose nodes have these sensors and reference coordinates.
 
-    `ours` converts Exudyn's coordinates, velocities and accelerations to those of the problem; None: they are the same.
+    `convert` makes those of the problem of Exudyn's coordinates, velocities and accelerations; None: they are the same.
     With dependent rows, which Exudyn's default linear solver does not support, a dense one ignores singular rows.
     """
     task, n_steps, solver, store_every, radius = steps
@@ -112,15 +112,11 @@ def run(
         message = limit.message("Exudyn", iteration.currentTime, "take fewer steps")
     elif failure:
         message = f"Exudyn failed in the step to t = {iteration.currentTime:.10g}: {failure}. Take more steps."
-    counts = {
-        "n_accepted": n_done,
-        "n_outer": iteration.newtonStepsCount,
-        "n_factorizations": iteration.newtonJacobiCount,
-    }
+    newton = {"n_outer": iteration.newtonStepsCount, "n_factorizations": iteration.newtonJacobiCount}
     q += reference[:, None]
     rows = np.concatenate([*((q, v, a) if convert is None else convert(q, v, a)), np.full((task.n_c, t.size), np.nan)])
     h = np.full(t.size - 1, iteration.currentStepSize) if store_every == 1 else None
-    return task.result("Exudyn", t, rows, message, h=h, **counts)
+    return task.result("Exudyn", t, rows, message, h=h, n_accepted=n_done, **newton)
 
 
 def _solve(mbs: Any, settings: Any, solver: str, limit: TimeLimit) -> str:
@@ -262,16 +258,8 @@ class Model:
     def torque(self, body: int, torque: ArrayLike) -> None:
         """Add a constant torque on a body, along the axes of space."""
         marker = self.mbs.AddMarker(items.MarkerBodyRigid(bodyNumber=self.bodies[body]))
-        self.mbs.AddLoad(
-            items.LoadTorqueVector(markerNumber=marker, loadVector=np.asarray(torque, dtype=float).tolist())
-        )
-
-    def _coordinate(self, body: int, coordinate: int) -> list[int]:
-        fixed = self.mbs.AddNode(items.NodePointGround())
-        return [
-            self.mbs.AddMarker(items.MarkerNodeCoordinate(nodeNumber=node, coordinate=k))
-            for node, k in ((fixed, 0), (self.nodes[body], coordinate))
-        ]
+        load = np.asarray(torque, dtype=float).tolist()
+        self.mbs.AddLoad(items.LoadTorqueVector(markerNumber=marker, loadVector=load))
 
     def force_sensor(self, joint: int, local: bool) -> int:
         """Add a sensor of the force of a joint; `local`: in the axes of its first marker."""
@@ -281,7 +269,9 @@ class Model:
 
     def hold(self, body: int, coordinate: int) -> None:
         """Keep a coordinate of a body constant."""
-        self.mbs.AddObject(items.ObjectConnectorCoordinate(markerNumbers=self._coordinate(body, coordinate)))
+        places = (self.mbs.AddNode(items.NodePointGround()), 0), (self.nodes[body], coordinate)
+        kinds = [items.MarkerNodeCoordinate(nodeNumber=node, coordinate=k) for node, k in places]
+        self.mbs.AddObject(items.ObjectConnectorCoordinate(markerNumbers=[self.mbs.AddMarker(each) for each in kinds]))
 
 
 def frame(z: ArrayLike) -> Array:

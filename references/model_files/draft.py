@@ -80,11 +80,8 @@ class Draft:
 
     def jointed(self, kind: str, body: str) -> str:
         """Return the name of a new joint."""
-        name = (
-            body
-            if body not in self.singles + self.balls and self.has("joint named as body", 0.3)
-            else self.named("joint")
-        )
+        as_body = body not in self.singles + self.balls and self.has("joint named as body", 0.3)
+        name = body if as_body else self.named("joint")
         self.singles += [name] if kind in "hs" else []
         self.balls += [name] if kind == "b" else []
         return name
@@ -140,18 +137,11 @@ class Draft:
     def pairs(self) -> list[tuple[str, str]]:
         """Return attributes of equalities of random bodies and joints."""
         ends = self.rng.permutation(self.tips)[:2]
-        found = [
-            (kind, " ".join(f'body{k + 1}="{x}"' for k, x in enumerate(sorted(ends)[::-1]) if x))
-            for kind in ("connect", "weld")
-        ]
+        drawn = {kind: ("body", sorted(ends)[::-1]) for kind in ("connect", "weld")}
         if len(self.singles) > 1:
-            found += [
-                (
-                    "joint",
-                    " ".join(f'joint{k + 1}="{x}"' for k, x in enumerate(self.rng.choice(self.singles, 2, False))),
-                )
-            ]
-        return found
+            drawn["joint"] = "joint", list(self.rng.choice(self.singles, 2, False))
+        numbered = ((kind, word, enumerate(names, 1)) for kind, (word, names) in drawn.items())
+        return [(kind, " ".join(f'{word}{k}="{x}"' for k, x in names if x)) for kind, word, names in numbered]
 
     def write(self, folder: Path) -> tuple[Path, Path]:
         """Write the files; return the paths of the main one, and of that for MuJoCo, which has no massless bodies."""
@@ -162,9 +152,8 @@ class Draft:
         (folder / "meshes" / "part.stl").write_bytes(bytes(80) + np.uint32(4).tobytes() + faces.tobytes())
         for name, part in self.files.items():
             (folder / name).write_text(part)
-        ours, theirs = (
-            folder / f"{name}.{'xml' if self.form == 'MJCF' else 'urdf'}" for name in ("model", "reference")
-        )
+        ending = "xml" if self.form == "MJCF" else "urdf"
+        ours, theirs = (folder / f"{name}.{ending}" for name in ("model", "reference"))
         ours.write_text(self.text)
         text = self.text
         for name in self.balls:  # in the other file these are types=

@@ -242,12 +242,8 @@ def _integrate(  # type: ignore[no-untyped-def]
     """
     m = given.shape[1] - 3 * n
     w = _Space(np.zeros((n, n)), np.zeros((m, n)), np.zeros(n), np.zeros(m), np.zeros(n))
-    r, displaced, J, pivots = (
-        np.zeros(n + m),
-        np.zeros(n + m),
-        np.zeros((n + m, n + m)),
-        np.zeros(n + m, dtype=np.int64),
-    )
+    r, displaced, pivots = np.zeros(n + m), np.zeros(n + m), np.zeros(n + m, dtype=np.int64)
+    J = np.zeros((n + m, n + m))
     combined, new = np.zeros(2 * n), past[(first - 1) % HIGHEST].copy()
     for step in range(first, last + 1):
         if step < given.shape[0]:

@@ -67,9 +67,7 @@ class Steps:
             self.stored.append((self.t0, self.start))
         try:
             self.solver = self.make(self.limit)
-            n_wanted = (
-                self.times.size if self.times is not None and self.times.size else np.inf
-            )  # number of output times
+            n_wanted = np.inf if self.times is None else self.times.size or np.inf  # number of output times
             while self.solver.status == "running" and not self.failure and len(self.stored) < n_wanted:
                 self.failure = self._attempt()
                 if not self.failure:

@@ -36,8 +36,8 @@ _OF_EACH = (  # functions with the prefix IDA or CVode
     "GetNumNonlinSolvIters:ipp GetNumJacEvals:ipp"
 )
 FUNCTIONS = {  # by library
-    "core": "SUNDIALSGetVersionNumber:ippppi SUNContext_Create:iip SUNContext_ClearErrHandlers:ip SUNContext_Free:ip "
-    "N_VGetArrayPointer:Rp N_VDestroy:-p SUNMatDestroy:-p SUNLinSolFree:ip",
+    "core": "SUNContext_Create:iip SUNContext_ClearErrHandlers:ip SUNContext_Free:ip N_VGetArrayPointer:Rp "
+    "N_VDestroy:-p SUNMatDestroy:-p SUNLinSolFree:ip",
     "nvecserial": "N_VMake_Serial:pxpp",
     "sunmatrixdense": "SUNDenseMatrix:pxxp SUNDenseMatrix_Data:Rp",
     "sunlinsoldense": "SUNLinSol_Dense:pppp",
@@ -61,12 +61,14 @@ def library() -> SimpleNamespace:
     try:
         from sksundae._cy_common import config
 
-        sizes = config["SUNDIALS_INT_TYPE"], config["SUNDIALS_FLOAT_TYPE"]
+        sizes, version = (config["SUNDIALS_INT_TYPE"], config["SUNDIALS_FLOAT_TYPE"]), config["SUNDIALS_VERSION"]
         paths = [str(path.locate()) for path in files("scikit-sundae") or ()]
     except (ImportError, KeyError, PackageNotFoundError) as error:
         raise _unsupported_wheel(f"{type(error).__name__}: {error}") from error
     if sizes != ("int", "double"):
         raise _unsupported_wheel(f"sunindextype and sunrealtype are {' and '.join(sizes)}")
+    if not version.startswith("7."):
+        raise _unsupported_wheel(f"SUNDIALS has the version {version}")
     functions: dict[str, Any] = {}
     for name, declarations in FUNCTIONS.items():
         matches = [path for path in paths if f"scikit_sundae.libs/libsundials_{name}-" in path]
@@ -79,10 +81,7 @@ def library() -> SimpleNamespace:
                 declared.restype, *declared.argtypes = (_TYPES[letter] for letter in types)
         except (OSError, AttributeError) as error:
             raise _unsupported_wheel(str(error)) from error
-    sundials = SimpleNamespace(**functions)
-    if (version := _version(sundials))[0] != 7:
-        raise _unsupported_wheel(f"SUNDIALS has the version {'.'.join(map(str, version))}")
-    return sundials
+    return SimpleNamespace(**functions)
 
 
 def check(name: str, flag: int) -> None:
@@ -114,13 +113,6 @@ def _unsupported_wheel(reason: str) -> RuntimeError:
         f"the SUNDIALS of the installed scikit-sundae cannot be driven: {reason}. references/sundials/library.py was "
         f"written for {WRITTEN_FOR}. references.sundials.ida.solve_ida does the same through Python"
     )
-
-
-def _version(sundials: SimpleNamespace) -> tuple[int, int, int]:
-    numbers, label = (INT * 3)(), ctypes.create_string_buffer(64)
-    places = [ctypes.byref(numbers, i * ctypes.sizeof(INT)) for i in range(3)]
-    sundials.SUNDIALSGetVersionNumber(*places, label, len(label))
-    return numbers[0], numbers[1], numbers[2]
 
 
 class Memory:
