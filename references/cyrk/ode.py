@@ -129,27 +129,17 @@ def solve_cyrk(
     """
     check_choice("method", method, tuple(NUMBERS))
     jacobian = _jacobian(*task.key) if method in IMPLICIT else None
-    functions = rate_of(*task.key), jacobian
-    times, rows, failure, counts = integrate(functions, task.y0, task, method, rtol, atol, max_step)
+    functions, limits = (rate_of(*task.key), jacobian), (rtol, atol, task.longest(max_step))
+    times, rows, failure, counts = integrate(functions, task.y0, task, method, *limits)
     return task.result(f"CyRK, {method},", times, rows.T, failure, **counts)
 
 
 def integrate(
-    functions: tuple[Any, Any],
-    start: Array,
-    task: Task,
-    method: str,
-    rtol: float,
-    atol: float,
-    max_step: float | None = None,
+    functions: tuple[Any, Any], start: Array, task: Task, method: str, *limits: float
 ) -> tuple[Array, Array, str, dict[str, int]]:
-    """Return the times reached, rows y there, error message or "", and counters.
-
-    `functions`: right-hand side and Jacobian, or None, in machine code.
-    """
+    """Return the times reached, rows y there, error message or "", and counters; arguments as of `Solver`."""
     with ExitStack() as stack:
-        solver = Solver(stack, task, start, method, functions, (rtol, atol), task.longest(max_step))
-        limit = TimeLimit(task.time_limit)
+        solver, limit = Solver(stack, functions, start, task, method, *limits), TimeLimit(task.time_limit)
         most = solver.most_steps(limit)
         run = solver.prepared(most)
         with user_call:
@@ -164,19 +154,15 @@ def integrate(
 
 
 class Solver:
-    """CyRK's solver of one task, with the vectors that it reads."""
+    """CyRK's solver of one task, with the vectors that it reads.
+
+    `functions`: right-hand side and Jacobian, or None, in machine code; `limits`: rtol, atol and the longest step.
+    """
 
     def __init__(
-        self,
-        stack: ExitStack,
-        task: Task,
-        start: Array,
-        method: str,
-        functions: tuple[Any, Any],
-        tolerances: tuple[float, float],
-        longest: float,
+        self, stack: ExitStack, functions: tuple[Any, Any], start: Array, task: Task, method: str, *limits: float
     ):
-        self.task, self.start, self.longest = task, np.array(start, dtype=float), longest
+        self.task, self.start, (*tolerances, self.longest) = task, np.array(start, dtype=float), limits
         self.rate, self.jacobian = (None if function is None else function.address for function in functions)
         self.tolerances = [np.array([tolerance]) for tolerance in tolerances]
         self.arguments = np.zeros(1, dtype=np.int64)

@@ -41,7 +41,7 @@ def prepare(rigid: Rigid, settings: Settings = Settings()) -> Prepared:  # noqa:
         every = n_steps // n_stored
         steps = check_steps(problem, t_end, n_steps, settings.solver, every, None, settings.radius)
         model, sensor, axes = build()
-        result = run_exudyn(model.mbs, model.sensors, np.concatenate(model.reference), steps, None, dependent)
+        result = run_exudyn(model, steps, dependent_rows=dependent)
         call = time.process_time() - began
         located = parts.states(planar, result.q, result.v)
         f = np.full((result.t.size, 3), np.nan) if sensor < 0 else model.mbs.GetSensorStoredData(sensor)[:, 1:4]

@@ -31,14 +31,8 @@ class ExactEqualities:
         mj.set_mju_user_warning(lambda text: None)  # by default MuJoCo writes them to a file in the working directory
         spec = mj.MjSpec.from_file(str(path))
         if loop:
-            spec.add_equality(
-                name="loop",
-                type=mj.mjtEq.mjEQ_CONNECT,
-                objtype=mj.mjtObj.mjOBJ_BODY,
-                name1=loop[0],
-                name2=loop[1],
-                data=[*LOOP_AT, *[0.0] * 9],
-            )
+            kinds = {"type": mj.mjtEq.mjEQ_CONNECT, "objtype": mj.mjtObj.mjOBJ_BODY}
+            spec.add_equality(name="loop", **kinds, name1=loop[0], name2=loop[1], data=[*LOOP_AT, *[0.0] * 9])
         self.m, self.rng = spec.compile(), rng
         bits = mj.mjtDisableBit
         self.m.opt.disableflags |= int(bits.mjDSBL_CONTACT | bits.mjDSBL_LIMIT | bits.mjDSBL_FRICTIONLOSS)

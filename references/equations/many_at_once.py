@@ -112,10 +112,8 @@ def by_cyrk(problems: Sequence[Problem], t_end: float) -> Solve:
 
     def solve(tol: float) -> Array:
         if tol not in solvers:
-            solvers[tol] = [
-                Solver(stack, task, task.y0, "DOP853", (rate, None), (tol, tol), t_end)
-                for task, rate in zip(tasks, rates, strict=True)
-            ]
+            pairs = zip(tasks, rates, strict=True)
+            solvers[tol] = [Solver(stack, (f, None), task.y0, task, "DOP853", tol, tol, t_end) for task, f in pairs]
         runs = [solver.prepared(0) for solver in solvers[tol]]
         with user_call:
             for run in runs:
@@ -148,11 +146,9 @@ def by_cvode(problems: Sequence[Problem], t_end: float) -> Solve:
 
 def _tasks(problems: Sequence[Problem], t_end: float) -> tuple[list[Task], list[tuple[Any, ...]]]:
     """Return the tasks of runs that are made singly, and the key of the equations of each: one, if parameters agree."""
-    tasks = [
-        Task(with_all_rows(problem.system), problem.system.n_c, 0.0, t_end, problem.q0, problem.v0)
-        for problem in problems
-    ]
-    alike = all((problem.system.parameters == problems[0].system.parameters).all() for problem in problems)
+    given = [(problem.system, problem.q0, problem.v0) for problem in problems]
+    tasks = [Task(with_all_rows(system), system.n_c, 0.0, t_end, q0, v0) for system, q0, v0 in given]
+    alike = all((system.parameters == problems[0].system.parameters).all() for system, _, _ in given)
     return tasks, [tasks[0].key if alike else task.key for task in tasks]
 
 

@@ -73,12 +73,11 @@ def solve_exudyn(
         raise error(f"problem must be a four-bar linkage, of A02 or one of {', '.join(MODELS)}; given {given!r}")
     steps = check_steps(problem, t_end, n_steps, solver, store_every, time_limit, spectral_radius)
     model, convert = model_of(problem), None
-    reference = np.concatenate(model.reference)
     if problem.name == bricard().name:
         convert = _with_matrices
-    elif problem.name.startswith("A02") and problem.q0.size != reference.size:
+    elif problem.name.startswith("A02") and problem.q0.size != 3 * len(model.bodies):
         convert = _with_tips
-    return run(model.mbs, model.sensors, reference, steps, convert, problem.name.startswith(REDUNDANT))
+    return run(model, steps, convert, problem.name.startswith(REDUNDANT))
 
 
 def model_of(problem: Problem) -> Model:
@@ -243,7 +242,7 @@ def solve_pinned(
     for pin in bodies.pins:
         model.pin(*pin)
     model.mbs.Assemble()
-    return run(model.mbs, model.sensors, np.concatenate(model.reference), steps, None)
+    return run(model, steps)
 
 
 def _line(name: str, options: dict[str, Any], **fields: Any) -> Line:

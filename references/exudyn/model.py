@@ -5,7 +5,7 @@ with error control (`automaticStepSize`: DOPRI5, ODE23) are explicit and reject 
 """
 
 import contextlib
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -78,20 +78,14 @@ def add_sensors(mbs: Any, node: int) -> list[int]:
     return [mbs.AddSensor(items.SensorNode(**options, outputVariableType=output)) for output in outputs]
 
 
-def run(
-    mbs: Any,
-    sensors: Sequence[list[int]],
-    reference: Array,
-    steps: Steps,
-    convert: Convert | None,
-    dependent_rows: bool = False,
-) -> Result:
-    """Solve an assembled system whose nodes have these sensors and reference coordinates.
+def run(model: Any, steps: Steps, convert: Convert | None = None, dependent_rows: bool = False) -> Result:
+    """Solve an assembled system `mbs` of a model whose nodes have `sensors` and reference coordinates.
 
     `convert` makes those of the problem of Exudyn's coordinates, velocities and accelerations; None: they are the same.
     With dependent rows, which Exudyn's default linear solver does not support, a dense one ignores singular rows.
     """
     task, n_steps, solver, store_every, radius = steps
+    mbs, reference = model.mbs, np.concatenate(model.reference)
     settings = _settings(task.t1, n_steps, store_every)
     if dependent_rows:
         settings.linearSolver.solverType = exu.LinearSolverType.EigenDense
@@ -102,7 +96,9 @@ def run(
     limit = TimeLimit(task.time_limit)
     with _silence(), user_call:
         failure = _solve_hht(mbs, settings, limit) if solver == "HHT" else _solve(mbs, settings, solver, limit)
-    tables = [[mbs.GetSensorStoredData(sensor) for sensor in node] for node in sensors]  # (n_t, 1 + n), time first
+    tables = [
+        [mbs.GetSensorStoredData(sensor) for sensor in node] for node in model.sensors
+    ]  # (n_t, 1 + n), time first
     t = tables[0][0][:, 0]
     q, v, a = (np.concatenate([node[k][:, 1:] for node in tables], axis=1).T for k in range(len(_OUTPUTS)))
     iteration = mbs.sys["dynamicSolver"].it

@@ -323,7 +323,8 @@ def solve_heyoka_minimal(equations: Minimal, task: Task, tol: float = 1e-8) -> t
 def solve_cvode_minimal(equations: Minimal, task: Task, rtol: float = 1e-8, atol: float = 1e-8) -> tuple[Any, ...]:
     """Integrate a mechanism in minimal coordinates by CVODE's Adams methods, driven from C."""
     functions = cvode_c.Functions(_right_hand_side(equations, cvode_c.right_hand_side))
-    return "CVODE, Adams,", *cvode_c.integrate(functions, np.array(equations.start), task, "Adams", rtol, atol)
+    given = functions, np.array(equations.start), task, "Adams", rtol, atol, task.longest(None)
+    return "CVODE, Adams,", *cvode_c.integrate(*given)
 
 
 @_adapter
@@ -331,8 +332,9 @@ def solve_cyrk_minimal(
     equations: Minimal, task: Task, rtol: float = 1e-8, atol: float = 1e-8, *, method: str = "DOP853"
 ) -> tuple[Any, ...]:
     """Integrate a mechanism in minimal coordinates by one of CyRK's explicit methods, "DOP853" or "Vern8"."""
-    rate = _right_hand_side(equations, ode.right_hand_side)
-    return f"CyRK, {method},", *ode.integrate((rate, None), np.array(equations.start), task, method, rtol, atol)
+    functions = _right_hand_side(equations, ode.right_hand_side), None
+    given = functions, np.array(equations.start), task, method, rtol, atol, task.longest(None)
+    return f"CyRK, {method},", *ode.integrate(*given)
 
 
 @lru_cache(maxsize=256)

@@ -124,10 +124,7 @@ def trajectory(parameters: Mapping[str, Any], times: ArrayLike) -> tuple[Array, 
     return MinimalFourBar.from_parameters(parameters).states(times)
 
 
-@lru_cache(maxsize=64)
-def _linkage(*arguments: Any) -> MinimalFourBar:
-    """Return the linkage, integrated once."""
-    return MinimalFourBar(*arguments)
+_linkage = lru_cache(maxsize=64)(MinimalFourBar)  # integrated once
 
 
 @compiled_when_called(error_model="numpy")

@@ -9,7 +9,7 @@ import ctypes
 import io
 from collections.abc import Callable
 from contextlib import ExitStack, redirect_stdout, suppress
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -73,6 +73,7 @@ def solve_cvode(task: Task, rtol: float = 1e-8, atol: float = 1e-8) -> Result:
     return task.result(name, states.t, states.y.T, failure, **counts)
 
 
+POINTER = types.voidptr
 MOST_ITERATIONS = 10  # Newton's method usually needs one or two
 AGAIN = 1  # return value of a failed projection, which makes CVODE reduce the step
 
@@ -123,9 +124,7 @@ def projection_for_cvode(
         for j in range(n):
             from_v[j] -= x[j]
 
-    pointer = types.voidptr
-
-    @cfunc(types.int32(types.float64, pointer, pointer, types.float64, types.intp, pointer), error_model="numpy")
+    @cfunc(types.int32(types.float64, POINTER, POINTER, types.float64, types.intp, POINTER), error_model="numpy")
     def projection(t, y, corr, bound, err, memory):  # type: ignore[no-untyped-def]
         given, state = carray(array_of(y), (size,)), carray(array_of(corr), (size,))
         data = carray(memory, (n_memory,), np.float64)
@@ -174,7 +173,6 @@ COUNTERS: dict[str, dict[str, tuple[str, ...]]] = {
 }
 COUNTERS["BDF"] = {"n_evaluations": ("RhsEvals", "LinRhsEvals"), "n_factorizations": ("LinSolvSetups",)}
 COUNTERS["BDF"] |= {"n_jacobians": ("JacEvals",)}
-POINTER = types.voidptr
 
 
 class Functions(NamedTuple):
@@ -213,7 +211,8 @@ def solve_cvode_c(
         raise ValueError(f"projected needs method 'BDF', with which alone CVODE projects; given {method!r}")
     jacobian = _jacobian(*task.key) if method == "BDF" else None
     functions = Functions(_rate(*task.key), jacobian, *_projection(task.system, projected, rtol, atol))
-    times, rows, failure, counts = integrate(functions, task.y0, task, method, rtol, atol, max_step)
+    limits = rtol, atol, task.longest(max_step)
+    times, rows, failure, counts = integrate(functions, task.y0, task, method, *limits)
     return task.result(f"CVODE, {method},", times, rows.T, failure, **counts)
 
 
@@ -260,22 +259,22 @@ def _projection(system: ConstrainedSystem, projected: bool, rtol: float, atol: f
 
 
 def integrate(
-    functions: Functions, start: Array, task: Task, method: str, rtol: float, atol: float, max_step: float | None = None
+    functions: Functions, start: Array, task: Task, method: str, *limits: float
 ) -> tuple[Array, Array, str, dict[str, int]]:
-    """Return the times reached, rows y there, error message or "", and CVODE's counters."""
-    set_up = partial(_set_up, functions, task, method, rtol, atol)
-    return run("CVode", start[None], task, (METHODS[method],), set_up, max_step, COUNTERS[method], ADVICE)
+    """Return the times reached, rows y there, error message or "", and CVODE's counters; arguments as of `_memory`."""
+    return run(lambda stack: _memory(stack, functions, start, task, method, *limits), task, COUNTERS[method], ADVICE)
 
 
 def adams_memory(stack: ExitStack, task: Task, key: tuple[Any, ...], tolerance: float) -> Memory:
     """Return the memory of a run by the Adams methods; it lasts as long as the stack. `key`: of the equations."""
-    solver = Memory(stack, "CVode", task.y0[None], task, METHODS["Adams"])
-    _set_up(Functions(_rate(*key)), task, "Adams", tolerance, tolerance, solver)
-    solver.bound_steps(task.longest(None))
-    return solver
+    limits = tolerance, tolerance, task.longest(None)
+    return _memory(stack, Functions(_rate(*key)), task.y0, task, "Adams", *limits)
 
 
-def _set_up(functions: Functions, task: Task, method: str, rtol: float, atol: float, solver: Memory) -> None:
+def _memory(stack: ExitStack, functions: Functions, start: Array, task: Task, method: str, *limits: float) -> Memory:
+    """Return the memory of a run; `limits`: rtol, atol and the longest step."""
+    rtol, atol, longest = limits
+    solver = Memory(stack, "CVode", start[None], task, METHODS[method])
     solver.call("Init", functions.rate.address, task.t0, *solver.vectors)
     solver.call("SStolerances", float(rtol), float(atol))
     if method == "Adams":
@@ -287,6 +286,8 @@ def _set_up(functions: Functions, task: Task, method: str, rtol: float, atol: fl
     if functions.projection is not None:
         solver.call("SetUserData", functions.data.ctypes.data)
         solver.call("SetProjFn", functions.projection.address)
+    solver.bound_steps(longest)
+    return solver
 
 
 LINES = (

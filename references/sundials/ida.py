@@ -8,7 +8,7 @@ private part of scikit-sundae, with a hash in its file names: only `WRITTEN_FOR`
 
 import io
 import time
-from contextlib import redirect_stdout
+from contextlib import ExitStack, redirect_stdout
 from functools import lru_cache
 from types import SimpleNamespace
 from typing import Any
@@ -70,9 +70,8 @@ def solve_ida(
     keep = np.diff(output.t, prepend=-np.inf) > 0.0  # a failed run contains its last state twice
     t, rows = output.t[keep], equations.columns(output.y.T, output.yp.T)[:, keep]
     counts = {"n_evaluations": int(outcome.nfev), "n_factorizations": int(outcome.njev)}
-    if task.times is not None:
-        return task.result("IDA", t, rows, failure, **counts)
-    return task.result("IDA", t, rows, failure, h=np.diff(t), n_accepted=t.size - 1, **counts)
+    every_step = {"h": np.diff(t), "n_accepted": t.size - 1} if task.times is None else {}
+    return task.result("IDA", t, rows, failure, **counts, **every_step)
 
 
 def states_at(solver: Any, span: tuple[float, float], times: Array, *start: Array) -> SimpleNamespace:
@@ -191,16 +190,17 @@ def solve_ida_c(
     room = () if widths is None else (order.astype(float), np.zeros(3 * size + size * size))
     data = np.concatenate([array.ravel() for array in (*form.space, *room)])
 
-    def set_up(solver: Memory) -> None:
+    def make(stack: ExitStack) -> Memory:
+        solver = Memory(stack, "IDA", form.start[:, order], task)
         solver.call("Init", residual.address, task.t0, *solver.vectors)
         solver.call("SVtolerances", rtol, solver.vector(absolute[order]))
         solver.call("SetMaxOrd", max_order)
         solver.call("SetUserData", data.ctypes.data)
         solver.solve_directly(jacobian, widths)
+        solver.bound_steps(task.longest(max_step))
+        return solver
 
-    times, rows, failure, counts = run(
-        "IDA", form.start[:, order], task, (), set_up, max_step, IDA_COUNTERS, ADVICE_FROM_C
-    )
+    times, rows, failure, counts = run(make, task, IDA_COUNTERS, ADVICE_FROM_C)
     y, yp = (array[np.argsort(order)] for array in np.split(rows.T, 2))
     return task.result("IDA", times, form.columns(y, yp), failure, **counts)
 

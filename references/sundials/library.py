@@ -224,35 +224,20 @@ class Memory:
 
 
 def run(
-    kind: str,
-    start: Array,
-    task: Task,
-    arguments: tuple[int, ...],
-    set_up: Callable[[Memory], None],
-    max_step: float | None,
-    counters: Mapping[str, tuple[str, ...]],
-    advice: str,
+    make: Callable[[ExitStack], Memory], task: Task, counters: Mapping[str, tuple[str, ...]], advice: str
 ) -> tuple[Array, Array, str, dict[str, int]]:
     """Return the times reached, states there as rows, error message or "", and counters.
 
     A second use of the memory is timed, as in SUNDIALS' guides: ReInit, and steps to the end without output. The output
     run has a memory of its own, because CVODE's ReInit does not reset the time of the last projection.
     """
-    longest = task.longest(max_step)
-
-    def ready(stack: ExitStack) -> Memory:
-        solver = Memory(stack, kind, start, task, *arguments)
-        set_up(solver)
-        solver.bound_steps(longest)
-        return solver
-
     with ExitStack() as stack:
-        solver, limit = ready(stack), TimeLimit(task.time_limit)
+        solver, limit = make(stack), TimeLimit(task.time_limit)
         with user_call:
             solver.restart()
             flag = solver.go_to_the_end(limit)
         counts = {name: sum(map(solver.counter, parts)) for name, parts in (COUNTERS | dict(counters)).items()}
         failure, times = solver.failure(flag, limit, advice), task.instants[task.instants <= solver.reached.value]
     with ExitStack() as stack:
-        rows = ready(stack).rows_at(times)
+        rows = make(stack).rows_at(times)
     return times[: len(rows)], rows, failure, counts

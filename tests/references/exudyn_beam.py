@@ -8,6 +8,7 @@ measures how closely.
 """
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 
@@ -28,8 +29,8 @@ def solve_exudyn_beam(
     `ancf_beam`; NaN where the model has no such quantity: the directors, with "shear" also the slopes. So is `lam`.
     """
     steps = check_steps(problem, t_end, n_steps, solver, store_every, time_limit)
-    _container, mbs, sensors, reference = _model(problem.parameters, model)
-    n_nodes = len(reference)
+    made = _model(problem.parameters, model)
+    n_nodes = len(made.reference)
     kept = 4 if model == "cable" else 2  # of x, y, slopes the first model has all, the second x, y and an angle
 
     def among_six(coordinates):
@@ -38,11 +39,11 @@ def solve_exudyn_beam(
         inserted[:, :kept] = coordinates.reshape(n_nodes, -1, coordinates.shape[1])[:, :kept]
         return inserted.reshape(-1, coordinates.shape[1])
 
-    return run(mbs, sensors, reference.ravel(), steps, lambda q, v, a: (among_six(q), among_six(v), among_six(a)))
+    return run(made, steps, lambda q, v, a: (among_six(q), among_six(v), among_six(a)))
 
 
 def _model(p, model):
-    """Return Exudyn's container, its system, the sensors [node][output], and the reference coordinates [node]."""
+    """Return Exudyn's container, its system, the sensors [node][output] and the reference coordinates [node]."""
     container = exu.SystemContainer()
     mbs = container.AddSystem()
     n_elements = p["n_elements"]
@@ -62,7 +63,7 @@ def _model(p, model):
     _hold(mbs, p, nodes[0])
     sensors = [add_sensors(mbs, node) for node in nodes]
     mbs.Assemble()
-    return container, mbs, sensors, reference
+    return SimpleNamespace(container=container, mbs=mbs, sensors=sensors, reference=reference)
 
 
 def _element(p, model, length):
