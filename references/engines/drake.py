@@ -7,19 +7,8 @@ import numpy as np
 
 from references.driver import imported
 from references.engines import rigid as parts
-from references.engines.rigid import (
-    BALL,
-    HINGE,
-    NOT_REPORTED,
-    SLIDE,
-    Array,
-    Configured,
-    Engine,
-    Motion,
-    Prepared,
-    Rigid,
-    State,
-)
+from references.engines.rigid import BALL, HINGE, NOT_REPORTED, SLIDE, Configured, Engine, Motion, Prepared, Rigid
+from twoloop.problem.problem import Array
 
 
 class Settings(NamedTuple):
@@ -52,7 +41,7 @@ def prepare(rigid: Rigid, settings: Settings = Settings()) -> Prepared:  # noqa:
                 return str(error).strip().splitlines()[0]
             return ""
 
-        def see() -> State:
+        def see() -> parts.State:
             poses = [plant.EvalBodyPoseInWorld(context, body) for body in bodies]
             twists = [plant.EvalBodySpatialVelocityInWorld(context, body) for body in bodies]
             x = np.array([pose.translation() for pose in poses])

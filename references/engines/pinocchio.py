@@ -37,18 +37,15 @@ def prepare(rigid: Rigid, settings: Settings = Settings()) -> Prepared:  # noqa:
             (joint, origin * pin.SE3(np.eye(3), point))
             for (joint, origin), point in ((frames[a.number], on_a), (frames[b.number], on_b))
         ]
-        constraint = pin.RigidConstraintModel(
-            pin.ContactType.CONTACT_3D, model, *ends[0], *ends[1], pin.ReferenceFrame.LOCAL
-        )
+        kind, axes = pin.ContactType.CONTACT_3D, pin.ReferenceFrame.LOCAL
+        constraint = pin.RigidConstraintModel(kind, model, *ends[0], *ends[1], axes)
         if settings.baumgarte is not None:
             gains = constraint.m_baumgarte_parameters
             gains.Kp, gains.Kd = settings.baumgarte**2, 2.0 * settings.baumgarte
             constraint.setBaumgarteCorrectorParameters(gains)
         constraints.append(constraint)
     n_points = {"spherical": 1, "revolute": 2}[rigid.loops[0].kind] if rigid.loops else 0
-    proximal = pin.ProximalSettings()
-    if settings.mu is not None:
-        proximal = pin.ProximalSettings(1e-14, settings.mu, settings.iterations)
+    proximal = pin.ProximalSettings(*(() if settings.mu is None else (1e-14, settings.mu, settings.iterations)))
 
     def run(t_end: float, n_steps: int, n_stored: int) -> Motion:
         began = time.process_time()
@@ -117,14 +114,11 @@ def _tree(pin: Any, rigid: Rigid) -> tuple[Any, dict[int, tuple[int, Any]]]:
         place = origin * pin.SE3(parent.rotation.T @ body.rotation, parent.local_point(body.in_space(point)))
         for k, (kind, axis) in enumerate(parts.freedoms(body, joint)):
             kinds = {BALL: pin.JointModelSpherical, SLIDE: pin.JointModelPrismaticUnaligned}
-            joint_model = kinds[kind]() if kind == BALL else kinds.get(kind, pin.JointModelRevoluteUnaligned)(axis)
-            number = model.addJoint(
-                number, joint_model, place if k == 0 else pin.SE3.Identity(), f"{joint.name} {k + 1}"
-            )
+            freedom = kinds[kind]() if kind == BALL else kinds.get(kind, pin.JointModelRevoluteUnaligned)(axis)
+            number = model.addJoint(number, freedom, pin.SE3.Identity() if k else place, f"{joint.name} {k + 1}")
         origin = pin.SE3(np.eye(3), -point)
-        model.appendBodyToJoint(
-            number, pin.Inertia(float(body.inertia[0]), np.zeros(3), parts.tensor(body.inertia)), origin
-        )
+        inertia = pin.Inertia(float(body.inertia[0]), np.zeros(3), parts.tensor(body.inertia))
+        model.appendBodyToJoint(number, inertia, origin)
         frames[body.number] = number, origin
     return model, frames
 

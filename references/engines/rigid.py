@@ -165,10 +165,8 @@ def freedoms(body: Body, joint: ModelJoint) -> list[tuple[str, Array]]:
     if joint.kind == "spherical":
         return [(BALL, np.array(Z))]
     if joint.kind == "universal":
-        axes = [
-            body.local_direction(end.rotation @ axis_in_end)
-            for end, axis_in_end in zip((joint.a, joint.b), joint.axes, strict=True)
-        ]
+        ends = zip((joint.a, joint.b), joint.axes, strict=True)
+        axes = [body.local_direction(end.rotation @ axis) for end, axis in ends]
         return [(HINGE, axis) for axis in (axes if joint.b is body else axes[::-1])]
     axis = joint.axes[1] if joint.b is body else -joint.axes[0]
     return [(HINGE if joint.kind == "revolute" else SLIDE, axis)]
@@ -176,10 +174,9 @@ def freedoms(body: Body, joint: ModelJoint) -> list[tuple[str, Array]]:
 
 def springs(model: Any) -> list[tuple[Body, Array, Body, Array, tuple[float, ...]]]:
     """Return both ends of each spring in body axes, with stiffness, damping and length."""
+    found = [f for f in model.forces if f.kind == SPRING]
     return [
-        (f.first, np.array(f.on_first.values), f.second, np.array(f.on_second.values), f.more.values)
-        for f in model.forces
-        if f.kind == SPRING
+        (f.first, np.array(f.on_first.values), f.second, np.array(f.on_second.values), f.more.values) for f in found
     ]
 
 
@@ -253,10 +250,8 @@ def coordinates(motion: Motion, planar: bool) -> tuple[Array, Array]:
     n_t, n = motion.x.shape[:2]
     if planar:
         angles = np.unwrap(np.arctan2(motion.R[..., 1, 0], motion.R[..., 0, 0]), axis=0)
-        q, v = (
-            np.concatenate(parts, axis=2)
-            for parts in ((motion.x[..., :2], angles[..., None]), (motion.v[..., :2], motion.w[..., 2:]))
-        )
+        q = np.concatenate([motion.x[..., :2], angles[..., None]], axis=2)
+        v = np.concatenate([motion.v[..., :2], motion.w[..., 2:]], axis=2)
     else:
         q, v = np.empty((n_t, n, 7)), np.empty((n_t, n, 7))
         q[..., :3], v[..., :3] = motion.x, motion.v

@@ -90,9 +90,7 @@ def lu_factor(A, pivots):  # type: ignore[no-untyped-def]
         pivots[k], scale[pivot] = pivot, scale[k]
         if pivot != k:
             for j in range(n):
-                swapped = A[k, j]
-                A[k, j] = A[pivot, j]
-                A[pivot, j] = swapped
+                A[k, j], A[pivot, j] = A[pivot, j], A[k, j]
         for i in range(k + 1, n):
             if A[i, k] != 0.0:
                 A[i, k] /= A[k, k]

@@ -116,8 +116,7 @@ class Expressions:
 
     def derivatives(self) -> Iterator[list[Affine]]:
         """Yield the derivatives of the accelerations with respect to each of [q, v], as 2 n_q lists (n_q,) of forms."""
-        for right_side in self.right_hand_sides():
-            yield _substituted(self.factors, right_side)[: self.system.n_q]
+        return (_substituted(self.factors, right_side)[: self.system.n_q] for right_side in self.right_hand_sides())
 
     def right_hand_sides(self) -> Iterator[list[Affine]]:
         """Yield the right-hand sides for these derivatives, whose matrix is that of eq. (6), factorised once.
@@ -253,11 +252,8 @@ def _order(
         else:
             i = min((j for j in remaining if not waits[j]), key=lambda j: (len(neighbours[j]), early * depth[j], j))
             neighbourhood = neighbours[i] | {i}
-            equal = [
-                j
-                for j in neighbourhood - {i}
-                if not waits[j] and (j < n) == (i < n) and neighbours[j] | {j} == neighbourhood
-            ]
+            near = (j for j in neighbourhood - {i} if not waits[j] and (j < n) == (i < n))
+            equal = [j for j in near if neighbours[j] | {j} == neighbourhood]
             places = (i, *(sorted(equal)[:1] if together else ()))
         order.append(places)
         remaining -= set(places)

@@ -72,19 +72,14 @@ def solve_exudyn(
         error, given = (ValueError, problem.name) if isinstance(problem, Problem) else (TypeError, problem)
         raise error(f"problem must be a four-bar linkage, of A02 or one of {', '.join(MODELS)}; given {given!r}")
     steps = check_steps(problem, t_end, n_steps, solver, store_every, time_limit, spectral_radius)
-    model, convert = model_of(problem), None
+    model = MODELS.get(problem.name, _n_four_bar if problem.name.startswith("A02") else _four_bar)(problem)
+    model.mbs.Assemble()
+    convert = None
     if problem.name == bricard().name:
         convert = _with_matrices
     elif problem.name.startswith("A02") and problem.q0.size != 3 * len(model.bodies):
         convert = _with_tips
     return run(model, steps, convert, problem.name.startswith(REDUNDANT))
-
-
-def model_of(problem: Problem) -> Model:
-    """Return the assembled model of a problem."""
-    model = MODELS.get(problem.name, _n_four_bar if problem.name.startswith("A02") else _four_bar)(problem)
-    model.mbs.Assemble()
-    return model
 
 
 def has_model(problem: Problem) -> bool:
@@ -96,7 +91,7 @@ def _four_bar(problem: Problem) -> Model:
     p = problem.parameters
     model, lengths = Model((0.0, -p["gravity"], 0.0)), [p[f"L{i + 1}"] for i in range(3)]
     masses = [p["density"] * length for length in lengths]
-    model.planar_bodies(masses, [m * length**2 / 12.0 for m, length in zip(masses, lengths, strict=True)], problem)
+    model.add_bodies(masses, [m * length**2 / 12.0 for m, length in zip(masses, lengths, strict=True)], problem)
     model.pin(GROUND, (0.0, 0.0), 0, (-0.5 * lengths[0], 0.0))
     for i in range(2):
         model.pin(i, (0.5 * lengths[i], 0.0), i + 1, (-0.5 * lengths[i + 1], 0.0))
@@ -107,21 +102,16 @@ def _four_bar(problem: Problem) -> Model:
 def _heavy_top(problem: Problem) -> Model:
     p = problem.parameters
     model = Model((0.0, 0.0, -p["gravity"]))
-    top = model.body(p["mass"], p["inertia"], problem.q0, problem.v0)
-    model.joint(GROUND, top, (0.0, 0.0, 0.0), np.eye(3), SPHERICAL)
+    model.add_bodies([p["mass"]], [p["inertia"]], problem)
+    model.joint(GROUND, 0, (0.0, 0.0, 0.0), np.eye(3), SPHERICAL)
     return model
-
-
-def _states(problem: Problem) -> list[tuple[Array, Array]]:
-    """Return the initial states (7,), (7,) of the bodies."""
-    return list(zip(problem.q0.reshape(-1, 7), problem.v0.reshape(-1, 7), strict=True))
 
 
 def _spatial_slider_crank(problem: Problem) -> Model:
     p = problem.parameters
     model = Model((0.0, 0.0, -9.81))
-    for name, (q, v) in zip(("crank", "rod", "slider"), _states(problem), strict=True):
-        model.body(p["masses"][name], p["inertias"][name], q, v)
+    masses, inertias = ([p[kind][name] for name in ("crank", "rod", "slider")] for kind in ("masses", "inertias"))
+    model.add_bodies(masses, inertias, problem)
     (centre, rod), (slider, _) = model.places[1:]
     model.joint(GROUND, 0, p["A"], frame(X), REVOLUTE)
     model.joint(0, 1, centre - 0.5 * p["rod"] * rod[:, 0], np.eye(3), SPHERICAL)
@@ -137,10 +127,8 @@ def _governor(problem: Problem) -> Model:
     centre = (0.5 * bar + BALL) * LENGTH / (bar + BALL)  # centre of mass of rod and ball, from the hinge
     axial, transverse, _ = box(bar, LENGTH, WIDTH, WIDTH)
     transverse += bar * (centre - 0.5 * LENGTH) ** 2 + BALL * (LENGTH - centre) ** 2
-    rod = (bar + BALL, (axial, transverse, transverse))
-    bodies = [(bar, box(bar, WIDTH, WIDTH, LENGTH)), (cube, box(cube, CUBE, CUBE, CUBE)), rod, rod]
-    for (mass, inertia), (q, v) in zip(bodies, _states(problem), strict=True):
-        model.body(mass, inertia, q, v)
+    inertias = [box(bar, WIDTH, WIDTH, LENGTH), box(cube, CUBE, CUBE, CUBE), *2 * [(axial, transverse, transverse)]]
+    model.add_bodies((bar, cube, bar + BALL, bar + BALL), inertias, problem)
     model.joint(GROUND, 0, (0.0, 0.0, 0.0), frame(Z), REVOLUTE)
     model.joint(0, 1, (0.0, 0.0, HEIGHT), np.roll(frame(Z), 1, axis=1), PRISMATIC)  # along z
     for body, side in ((2, 0.5 * CUBE), (3, -0.5 * CUBE)):
@@ -185,7 +173,7 @@ def _n_four_bar(problem: Problem) -> Model:
     n = problem.parameters["n"]
     start = n_four_bar(n, "bodies")
     model = Model((0.0, -problem.parameters["gravity"], 0.0))
-    model.planar_bodies((2 * n + 1) * [1.0], (2 * n + 1) * [1.0 / 12.0], start)
+    model.add_bodies((2 * n + 1) * [1.0], (2 * n + 1) * [1.0 / 12.0], start)
     for i in range(n + 1):
         model.pin(i, (-0.5, 0.0), GROUND, (float(i), 0.0))
     for j in range(n):
@@ -197,7 +185,7 @@ def _n_four_bar(problem: Problem) -> Model:
 def _slider_crank(problem: Problem) -> Model:
     p = problem.parameters
     model = Model((0.0, -p["gravity"], 0.0))
-    model.planar_bodies(p["masses"], p["inertias"], problem)
+    model.add_bodies(p["masses"], p["inertias"], problem)
     model.pin(0, (-0.5 * p["crank"], 0.0), GROUND, (0.0, 0.0))
     model.pin(1, (-0.5 * p["rod"], 0.0), 0, (0.5 * p["crank"], 0.0))
     model.pin(2, (0.0, 0.0), 1, (0.5 * p["rod"], 0.0))
@@ -238,7 +226,7 @@ def solve_pinned(
     """
     steps = check_steps(problem, problem.t_span[1], n_steps, solver, n_steps, time_limit)
     model = Model((0.0, -bodies.gravity, 0.0))
-    model.planar_bodies(bodies.masses, bodies.inertias, problem)
+    model.add_bodies(bodies.masses, bodies.inertias, problem)
     for pin in bodies.pins:
         model.pin(*pin)
     model.mbs.Assemble()

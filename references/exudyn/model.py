@@ -5,7 +5,7 @@ with error control (`automaticStepSize`: DOPRI5, ODE23) are explicit and reject 
 """
 
 import contextlib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -94,11 +94,10 @@ def run(model: Any, steps: Steps, convert: Convert | None = None, dependent_rows
         settings.linearSolver.solverType = exu.LinearSolverType.EigenSparse
     settings.timeIntegration.generalizedAlpha.spectralRadius = radius
     limit = TimeLimit(task.time_limit)
-    with _silence(), user_call:
+    with _changed(exu.config, "printToConsole", False), user_call:
         failure = _solve_hht(mbs, settings, limit) if solver == "HHT" else _solve(mbs, settings, solver, limit)
-    tables = [
-        [mbs.GetSensorStoredData(sensor) for sensor in node] for node in model.sensors
-    ]  # (n_t, 1 + n), time first
+    # (n_t, 1 + n) each, time first
+    tables = [[mbs.GetSensorStoredData(sensor) for sensor in node] for node in model.sensors]
     t = tables[0][0][:, 0]
     q, v, a = (np.concatenate([node[k][:, 1:] for node in tables], axis=1).T for k in range(len(_OUTPUTS)))
     iteration = mbs.sys["dynamicSolver"].it
@@ -117,14 +116,12 @@ def run(model: Any, steps: Steps, convert: Convert | None = None, dependent_rows
 
 def _solve(mbs: Any, settings: Any, solver: str, limit: TimeLimit) -> str:
     """Run one of Exudyn's own solvers; return an error message, or "" for success or at the time limit."""
-    previous = exu.special.solver.timeout
-    exu.special.solver.timeout = -1 if limit.seconds is None else limit.seconds
+    seconds = -1 if limit.seconds is None else limit.seconds
     try:
-        mbs.SolveDynamic(settings, solverType=getattr(exu.DynamicSolverType, solver))
+        with _changed(exu.special.solver, "timeout", seconds):
+            mbs.SolveDynamic(settings, solverType=getattr(exu.DynamicSolverType, solver))
     except exu.SolverError as error:
         return f"{error}: {mbs.sys['dynamicSolver'].GetErrorString()}"
-    finally:
-        exu.special.solver.timeout = previous
     return ""
 
 
@@ -159,14 +156,14 @@ def _settings(t_end: float, n_steps: int, store_every: int) -> Any:
 
 
 @contextlib.contextmanager
-def _silence() -> Iterator[None]:
-    """Suppress the output of Exudyn, whose console switch is global."""
-    previous = exu.config.printToConsole
-    exu.config.printToConsole = False
+def _changed(options: Any, name: str, value: float) -> Iterator[None]:
+    """Change one of Exudyn's options, which are global."""
+    previous = getattr(options, name)
+    setattr(options, name, value)
     try:
         yield
     finally:
-        exu.config.printToConsole = previous
+        setattr(options, name, previous)
 
 
 GROUND = -1
@@ -209,14 +206,15 @@ class Model:
     def planar_body(self, mass: float, inertia: float, q: Array, v: Array) -> int:
         """Add a body in the plane: centre and angle (3,), and their rates."""
         node = self.mbs.AddNode(items.NodeRigidBody2D(referenceCoordinates=q.tolist(), initialVelocities=v.tolist()))
-        body = self.mbs.AddObject(items.ObjectRigidBody2D(mass=mass, inertia=inertia, nodeNumber=node))
+        inertias = {"mass": float(mass), "inertia": float(inertia)}
+        body = self.mbs.AddObject(items.ObjectRigidBody2D(**inertias, nodeNumber=node))
         return self._added(body, node, q, (np.zeros(3), np.eye(3)))
 
-    def planar_bodies(self, masses: Iterable[float], inertias: Iterable[float], problem: Problem) -> None:
-        """Add planar bodies with the initial states of those of a problem."""
-        states = zip(problem.q0.reshape(-1, 3), problem.v0.reshape(-1, 3), strict=True)
-        for mass, inertia, state in zip(masses, inertias, states, strict=True):
-            self.planar_body(float(mass), float(inertia), *state)
+    def add_bodies(self, masses: Any, inertias: Any, problem: Problem) -> None:
+        """Add bodies with the initial states of those of a problem, in the plane or in space by their coordinates."""
+        states = (x.reshape(len(masses), -1) for x in (problem.q0, problem.v0))
+        for mass, inertia, q, v in zip(masses, inertias, *states, strict=True):
+            (self.planar_body if q.size == 3 else self.body)(mass, inertia, q, v)
 
     def _local(self, body: int, point: ArrayLike) -> tuple[int, list[float], Array]:
         """Return Exudyn's number of a body, a point of space in body axes, and its rotation matrix."""

@@ -33,8 +33,8 @@ def solve_heyoka(task: Task, tol: float = 1e-8, *, max_step: float | None = None
     Parameters, errors and result as in `references.driver`; statistics: n_accepted. The integrator is cached for the
     next run of the same system, start and tolerance, and its machine code in heyoka's own cache on disk.
     """
-    run = integrate(_integrator(*task.key, tol), task.y0, task, task.longest(max_step))
-    name, times, rows, failure, steps = run
+    integrator, longest = _integrator(*task.key, tol), task.longest(max_step)
+    name, times, rows, failure, steps = integrate(integrator, task.y0, task, longest)
     return task.result(name, times, rows.T, failure, n_accepted=steps)
 
 

@@ -131,9 +131,8 @@ def _residual(f, w, t, q, v, r):  # type: ignore[no-untyped-def]
 @njit(error_model="numpy")
 def _satisfy(f, w, t, q, v, enough, counters):  # type: ignore[no-untyped-def]
     """Solve eq. (15) for dependent positions, until a correction is below `enough`, and eq. (14) for velocities."""
-    m = w.C.size
-    correction, tries = np.inf, 0
-    while True:
+    m, correction = w.C.size, np.inf
+    for tries in range(MOST_NEWTON + 1):
         w.Cq[:, :] = 0.0
         f.jacobian(t, q, f.p, w.Cq)
         for i in range(m):
@@ -146,7 +145,6 @@ def _satisfy(f, w, t, q, v, enough, counters):  # type: ignore[no-untyped-def]
             break
         if tries == MOST_NEWTON:
             return False
-        tries += 1
         counters[NEWTON] += 1
         w.C[:] = 0.0
         f.constraint(t, q, f.p, w.C)
@@ -167,15 +165,14 @@ def _satisfy(f, w, t, q, v, enough, counters):  # type: ignore[no-untyped-def]
 @njit(error_model="numpy")
 def _project(f, w, t, q, v, counters):  # type: ignore[no-untyped-def]
     """Project q and v onto the constraints orthogonally in the norm of M; return False if that does not converge."""
-    correction, tries = np.inf, 0
-    while True:
+    correction = np.inf
+    for tries in range(MOST_NEWTON + 1):
         if not _matrices(f, w, t, q, w.W[0], counters):
             return False
         if correction <= KEPT:
             break
         if tries == MOST_NEWTON:
             return False
-        tries += 1
         counters[NEWTON] += 1
         w.C[:] = 0.0
         f.constraint(t, q, f.p, w.C)

@@ -39,16 +39,10 @@ class MinimalFourBar:
     """
 
     def __init__(
-        self,
-        lengths: tuple[float, float, float],
-        ground: float,
-        theta3: float,
-        branch: int,
-        density: float | tuple[float, float, float],
-        gravity: float,
+        self, lengths: ArrayLike, ground: float, theta3: float, branch: int, density: ArrayLike, gravity: float
     ):
         self._lengths = np.array(lengths, dtype=float)
-        for value in density if isinstance(density, tuple) else (density,):
+        for value in np.atleast_1d(density).tolist():
             check_positive("density", value)
         self._masses = np.array(density) * self._lengths
         self._gravity = gravity

@@ -44,7 +44,7 @@ def solve_fully_implicit(task: Task, method: str = "Radau", rtol: float = 1e-8, 
         y0, yp0 = functions.form.start
         return solver_type(functions.residual(limit), task.t0, y0, yp0, task.t1, **options)
 
-    run = Steps.timed(task, make_solver, functions.form.start.ravel(), functions)
+    run = Steps.timed(task, make_solver, functions.form.start.ravel())
     with user_call:
         run.go()
     output, counts = run.repeat_at(task.times), {}
@@ -59,8 +59,7 @@ class Functions:
     """F(t, y, y') and its derivatives in the signatures of the package."""
 
     def __init__(self, task: Task):
-        self.form, self.matrix = (form := Implicit(task, "stabilised")), form.matrix
-        self.raised = False  # a callback raised an exception
+        self.form = form = Implicit(task, "stabilised")
         self.residual(TimeLimit(None))(task.t0, *form.start)  # compiles
         self.jacobians(task.t0, *form.start)
 
@@ -72,11 +71,7 @@ class Functions:
             if time.monotonic() > limit.deadline:  # inlined: calling `limit` would cost 3 % of an evaluation
                 limit.check()
             out = np.empty_like(y)
-            try:
-                residual(t, y, yp, *space, out)
-            except BaseException:
-                self.raised = True
-                raise
+            residual(t, y, yp, *space, out)
             return out
 
         return function
@@ -84,12 +79,8 @@ class Functions:
     def jacobians(self, t: float, y: Array, yp: Array) -> tuple[Array, Array]:
         """Return dF/dy, by differences, and dF/dy', which consists of M, C_q^T and ones."""
         (n, m), (by_y, by_yp) = self.form.sizes, np.zeros((2, y.size, y.size))
-        try:
-            self.matrix(t, 0.0, y, yp, *self.form.space, by_y.T)
-            self.form.residual(t, y, yp, *self.form.space[:3], np.empty_like(y))  # evaluates M and C_q at y
-        except BaseException:
-            self.raised = True
-            raise
+        self.form.matrix(t, 0.0, y, yp, *self.form.space, by_y.T)
+        self.form.residual(t, y, yp, *self.form.space[:3], np.empty_like(y))  # evaluates M and C_q at y
         _, M, Cq = self.form.space[:3]
         by_yp[:n, :n], by_yp[n : 2 * n, n : 2 * n] = np.eye(n), M
         by_yp[n : 2 * n, 2 * n : 2 * n + m] = by_yp[:n, 2 * n + m :] = Cq.T

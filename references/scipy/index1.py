@@ -25,6 +25,7 @@ from twoloop.problem.problem import Array
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.result.result import Result
 
+NOT_FINITE = "infs or NaNs"  # in what SciPy's linear algebra says of them
 SMALLEST_STEP = 10.0  # units in the last place of t: SciPy's own limit, which LSODA lacks
 
 
@@ -35,7 +36,6 @@ class Steps:
     make: Callable[[TimeLimit], Any]  # limit -> the solver at its start; the limit is checked in every evaluation
     t0: float
     start: Array  # y, or [y, y']
-    callbacks: Any  # `raised`: a callback of the system raised; such an exception comes through, the solver's do not
     project: Callable[[float, Array], bool] | None  # (t, y) -> whether y, moved onto the constraints, is on them
     times: Array | None  # output times, by the solver's interpolant; None: the end of every step
     limit: TimeLimit
@@ -45,10 +45,10 @@ class Steps:
     solver: Any = None
 
     @classmethod
-    def timed(cls, task: Task, make: Any, start: Array, callbacks: Any, project: Any = None) -> "Steps":
+    def timed(cls, task: Task, make: Any, start: Array, project: Any = None) -> "Steps":
         """Return the timed run, which stores every step, or nothing if the task has output times."""
         times = None if task.times is None else task.times[:0]
-        return cls(make, task.t0, start, callbacks, project, times, TimeLimit(task.time_limit))
+        return cls(make, task.t0, start, project, times, TimeLimit(task.time_limit))
 
     @property
     def t(self) -> Array:
@@ -74,8 +74,8 @@ class Steps:
                     self._accept()
         except OutOfTimeError:
             self.failure = "out of time"
-        except ValueError as error:  # raised by the implicit solvers' linear algebra for NaN
-            if self.callbacks.raised:
+        except ValueError as error:  # raised by the implicit solvers' linear algebra for NaN, or else by a callback
+            if NOT_FINITE not in str(error):
                 raise
             self.failure = str(error)
 
@@ -83,8 +83,8 @@ class Steps:
         """Return the same steps, untimed, with the states at the given times that were reached; itself for None."""
         if times is None:
             return self
-        arguments = self.make, self.t0, self.start, self.callbacks, self.project
-        steps = Steps(*arguments, times[times <= self.ends[-1]], TimeLimit(None))
+        reached = times[times <= self.ends[-1]]
+        steps = Steps(self.make, self.t0, self.start, self.project, reached, TimeLimit(None))
         if times[0] <= self.ends[-1]:
             steps.go()
         self.failure = self.failure or steps.failure
@@ -232,7 +232,7 @@ def solve_index1(
     def make_solver(limit: TimeLimit) -> OdeSolver:
         return solver_type(equations.function(limit), t0, y0, task.t1, **options)
 
-    run = Steps.timed(task, make_solver, y0, equations, equations.project if projected else None)
+    run = Steps.timed(task, make_solver, y0, equations.project if projected else None)
     with user_call:
         run.go()
     counts = {"n_accepted": len(run.ends) - 1, "n_evaluations": int(equations.counters[0])}
@@ -253,7 +253,6 @@ class RightHandSide(Equations):
         self.derivative = _derivative(self.accelerate)
         self.projection = _projection(f.mass, f.constraint, f.jacobian, f.constraint_rate)
         self.counters = np.zeros(1, dtype=np.int64)
-        self.raised = False  # a callback raised an exception
 
     def function(self, limit: TimeLimit) -> Callable[[float, Array], Array]:
         """Return y' = f(t, y) in SciPy's signature."""
@@ -265,11 +264,7 @@ class RightHandSide(Equations):
         def fun(t, y):  # type: ignore[no-untyped-def]
             if monotonic() > deadline:
                 limit.check()
-            try:
-                return derivative(t, y, n_c, alpha, p, factors, mass_flags, counters)
-            except BaseException:
-                self.raised = True
-                raise
+            return derivative(t, y, n_c, alpha, p, factors, mass_flags, counters)
 
         return fun  # type: ignore[no-any-return]
 
@@ -296,11 +291,7 @@ class RightHandSide(Equations):
         p, factors, mass_flags, counters = self.system.functions.p, self.factors, self.known, self.counters
 
         def jac(t: float, y: Array) -> Array:
-            try:
-                return columns(t, y, n_c, alpha, p, factors, mass_flags, counters).T  # type: ignore[no-any-return]
-            except BaseException:
-                self.raised = True
-                raise
+            return columns(t, y, n_c, alpha, p, factors, mass_flags, counters).T  # type: ignore[no-any-return]
 
         jac(t, y)  # compiles
         self.counters[:] = 0

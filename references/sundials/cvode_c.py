@@ -22,7 +22,7 @@ from references.equations.straight_line import exact_jacobian, straight_line
 from references.lines import Line
 from references.scipy.index1 import RightHandSide
 from references.sundials.ida import states_at
-from references.sundials.library import RAISED, REALS, SMALLEST_STEP, Memory, create_object, library, run
+from references.sundials.library import RAISED, REALS, SMALLEST_STEP, Memory, library, run
 from twoloop.checks.arguments import check_choice
 from twoloop.problem.problem import Array
 from twoloop.problem.system import ConstrainedSystem
@@ -209,8 +209,12 @@ def solve_cvode_c(
     check_choice("method", method, tuple(METHODS))
     if projected and method != "BDF":
         raise ValueError(f"projected needs method 'BDF', with which alone CVODE projects; given {method!r}")
-    jacobian = _jacobian(*task.key) if method == "BDF" else None
-    functions = Functions(_rate(*task.key), jacobian, *_projection(task.system, projected, rtol, atol))
+    functions, f = Functions(_rate(*task.key), _jacobian(*task.key) if method == "BDF" else None), task.system.functions
+    if projected and task.system.n_c > 0:
+        projection, size = projection_for_cvode(*f[2:5], task.system.n_q, task.system.n_c, f.p.size)
+        data = np.zeros(size)
+        data[: f.p.size + 2] = [*f.p, rtol, atol]
+        functions = functions._replace(projection=projection, data=data)
     limits = rtol, atol, task.longest(max_step)
     times, rows, failure, counts = integrate(functions, task.y0, task, method, *limits)
     return task.result(f"CVODE, {method},", times, rows.T, failure, **counts)
@@ -247,17 +251,6 @@ def _jacobian(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes) -> Any
     return jacobian
 
 
-def _projection(system: ConstrainedSystem, projected: bool, rtol: float, atol: float) -> tuple[Any, Array]:
-    """Return CVODE's projection function, or None, and the user data."""
-    f = system.functions
-    if not projected or system.n_c == 0:
-        return None, np.empty(0)
-    projection, size = projection_for_cvode(*f[2:5], system.n_q, system.n_c, f.p.size)
-    data = np.zeros(size)
-    data[: f.p.size + 2] = [*f.p, rtol, atol]
-    return projection, data
-
-
 def integrate(
     functions: Functions, start: Array, task: Task, method: str, *limits: float
 ) -> tuple[Array, Array, str, dict[str, int]]:
@@ -279,8 +272,7 @@ def _memory(stack: ExitStack, functions: Functions, start: Array, task: Task, me
     solver.call("SStolerances", float(rtol), float(atol))
     if method == "Adams":
         free = solver.sundials.SUNNonlinSolFree_FixedPoint
-        iteration = create_object(solver.stack, "SUNNonlinSol_FixedPoint", free, *solver.vectors, 0, solver.own)
-        solver.call("SetNonlinearSolver", iteration)
+        solver.call("SetNonlinearSolver", solver.create("SUNNonlinSol_FixedPoint", free, *solver.vectors, 0))
     else:
         solver.solve_directly(functions.jacobian)
     if functions.projection is not None:

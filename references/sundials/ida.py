@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numba import carray, cfunc, njit, types
 
-from references.driver import CAUSES, Deferred, Task, TimeLimit, adapter, user_call
+from references.driver import CAUSES, Task, TimeLimit, adapter, imported, user_call
 from references.equations.accelerations import OPTIONS
 from references.lines import Line
 from references.sundials.library import RAISED, SMALLEST_STEP, Memory, library, run
@@ -24,8 +24,6 @@ from references.sundials.residual import FORMS, NOT_TESTED, Implicit, Parts, ban
 from twoloop.checks.arguments import check_choice, check_size
 from twoloop.problem.problem import Array
 from twoloop.result.result import Result
-
-ida = Deferred("sksundae.ida", "scikit-sundae")
 
 
 @adapter(independent_rows=True)
@@ -114,7 +112,7 @@ def _solver(equations: Implicit, t0: float, options: dict[str, Any], limit: Time
     size = state.shape[1]
     residual(t0, state[0], state[1], *space[:3], np.empty(size))  # compiles
     matrix(t0, 1.0, state[0], state[1], *space, np.zeros((size, size)).T)
-    return ida.IDA(resfn, jacfn=jacfn, **options)
+    return imported("sksundae.ida", "scikit-sundae", "references").IDA(resfn, jacfn=jacfn, **options)
 
 
 HIGHEST_ORDER = 5  # IDA's limit
@@ -248,39 +246,33 @@ def _compiled(parts: Parts, n: int, m: int, n_p: int, widths: tuple[int, int] | 
 
     @cfunc(types.int32(types.float64, pointer, pointer, pointer, pointer), **OPTIONS)
     def residual_of_ida(t, y, yp, res, memory):  # type: ignore[no-untyped-def]
-        p, M, Cq, _, _, _, _ = space(memory)
         try:
             if banded:
                 order, own_y, own_yp, own_res, _ = in_order(memory, vector(y), vector(yp))
-                residual(t, own_y, own_yp, p, M, Cq, own_res)
+                residual(t, own_y, own_yp, *space(memory)[:3], own_res)
                 out = vector(res)
                 for k in range(size):
                     out[k] = own_res[int(order[k])]
             else:
-                residual(t, vector(y), vector(yp), p, M, Cq, vector(res))
+                residual(t, vector(y), vector(yp), *space(memory)[:3], vector(res))
         except Exception:
             return RAISED
         return 0
 
     @cfunc(types.int32(types.float64, types.float64, *[pointer] * 8), **OPTIONS)
     def jacobian_of_ida(t, cj, y, yp, res, J, memory, work1, work2, work3):  # type: ignore[no-untyped-def]
-        p, M, Cq, K, y_displaced, residual_here, residual_displaced = space(memory)
         columns = carray(matrix_of(J), (size, depth))  # initialised to zero by IDA
         try:
             if banded:
                 order, own_y, own_yp, _, dense = in_order(memory, vector(y), vector(yp))
                 dense[:, :] = 0.0
-                iteration_matrix(
-                    t, cj, own_y, own_yp, p, M, Cq, K, y_displaced, residual_here, residual_displaced, dense
-                )
+                iteration_matrix(t, cj, own_y, own_yp, *space(memory), dense)
                 for j in range(size):  # an entry outside the band, were there one, would only slow Newton's method
                     column_in_order, column = dense[int(order[j])], columns[j]
                     for i in range(max(0, j - upper), min(size, j + lower + 1)):
                         column[above + i - j] = column_in_order[int(order[i])]
             else:
-                iteration_matrix(
-                    t, cj, vector(y), vector(yp), p, M, Cq, K, y_displaced, residual_here, residual_displaced, columns
-                )
+                iteration_matrix(t, cj, vector(y), vector(yp), *space(memory), columns)
         except Exception:
             return RAISED
         return 0

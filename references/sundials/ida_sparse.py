@@ -15,15 +15,13 @@ from numba.core.dispatcher import Dispatcher
 from numpy.typing import NDArray
 from scipy.sparse import bmat, coo_array, csc_array, eye_array
 
-from references.driver import CAUSES, Deferred, Task, TimeLimit, adapter, user_call
+from references.driver import CAUSES, Task, TimeLimit, adapter, imported, user_call
 from references.equations.accelerations import cached
 from references.equations.rows import accelerations
 from references.sundials.library import SMALLEST_STEP
 from references.sundials.residual import DIFFERENCE
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.result.result import Result
-
-ida = Deferred("sksundae.ida", "scikit-sundae")
 
 
 @adapter(velocity_rows=False)
@@ -56,9 +54,10 @@ def solve_ida_sparse(task: Task, rtol: float = 1e-8, atol: float = 1e-8) -> Resu
     y, yp = np.concatenate([task.y0, np.zeros(2 * m)]), np.concatenate([task.v0, a, lam, np.zeros(m)])
     steps = {"min_step": SMALLEST_STEP * (t1 - t0), "max_step": t1 - t0, "max_num_steps": 10**9}
     sparse = {"linsolver": "sparse", "sparsity": pattern, "jacfn": jacfn}
+    package = imported("sksundae.ida", "scikit-sundae", "references")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # about the unused pattern
-        solver: Any = ida.IDA(resfn, rtol=rtol, atol=atol, **sparse, **steps)
+        solver: Any = package.IDA(resfn, rtol=rtol, atol=atol, **sparse, **steps)
     jacfn(t0, y, yp, y, 1.0, np.zeros(pattern.nnz))  # compiles
     resfn(t0, y, yp, np.zeros_like(y))
     with user_call:

@@ -90,24 +90,6 @@ def check(name: str, flag: int) -> None:
         raise RuntimeError(f"{name} of SUNDIALS failed with {flag}")
 
 
-def create_object(stack: ExitStack, name: str, free: Callable[[Any], Any], *arguments: Any) -> Any:
-    """Return an object created by the function of this name; it is freed when the stack is closed."""
-    pointer = POINTER(getattr(library(), name)(*arguments))
-    if not pointer:
-        raise MemoryError(f"{name} of SUNDIALS failed")
-    stack.callback(free, pointer)
-    return pointer
-
-
-def context(stack: ExitStack) -> Any:
-    """Return a SUNDIALS context without the error handlers, which print."""
-    sundials, pointer = library(), POINTER()
-    check("SUNContext_Create", sundials.SUNContext_Create(SUN_COMM_NULL, ctypes.byref(pointer)))
-    stack.callback(sundials.SUNContext_Free, ctypes.byref(pointer))
-    check("SUNContext_ClearErrHandlers", sundials.SUNContext_ClearErrHandlers(pointer))
-    return pointer
-
-
 def _unsupported_wheel(reason: str) -> RuntimeError:
     return RuntimeError(
         f"the SUNDIALS of the installed scikit-sundae cannot be driven: {reason}. references/sundials/library.py was "
@@ -120,19 +102,28 @@ class Memory:
 
     def __init__(self, stack: ExitStack, kind: str, start: Array, task: Task, *given: int):
         self.kind, self.state, self.start, self.task = kind, start.copy(), start, task
-        self.stack, self.own, self.sundials = stack, context(stack), library()
+        self.stack, self.own, self.sundials = stack, POINTER(), library()
+        check("SUNContext_Create", self.sundials.SUNContext_Create(SUN_COMM_NULL, ctypes.byref(self.own)))
+        stack.callback(self.sundials.SUNContext_Free, ctypes.byref(self.own))
+        check("SUNContext_ClearErrHandlers", self.sundials.SUNContext_ClearErrHandlers(self.own))  # they print
         self.wrapped: list[Array] = []  # arrays that vectors wrap, and that must live as long as the vectors
         self.vectors = [self.vector(values) for values in self.state]
         free = getattr(self.sundials, f"{kind}Free")
-        release = lambda pointer: free(ctypes.byref(pointer))  # noqa: E731
-        self.memory = create_object(stack, f"{kind}Create", release, *given, self.own)
+        self.memory = self.create(f"{kind}Create", lambda pointer: free(ctypes.byref(pointer)), *given)
         self.reached = REAL(task.t0)
+
+    def create(self, name: str, free: Callable[[Any], Any], *arguments: Any) -> Any:
+        """Return an object created by the function of this name; it is freed when the stack is closed."""
+        pointer = POINTER(getattr(self.sundials, name)(*arguments, self.own))
+        if not pointer:
+            raise MemoryError(f"{name} of SUNDIALS failed")
+        self.stack.callback(free, pointer)
+        return pointer
 
     def vector(self, values: Array) -> Any:
         """Return a SUNDIALS vector that wraps an array."""
-        free = self.sundials.N_VDestroy
         self.wrapped.append(values)
-        return create_object(self.stack, "N_VMake_Serial", free, values.size, values.ctypes.data, self.own)
+        return self.create("N_VMake_Serial", self.sundials.N_VDestroy, values.size, values.ctypes.data)
 
     def call(self, name: str, *arguments: Any) -> None:
         """Call a function, which must return 0."""
@@ -145,10 +136,8 @@ class Memory:
         """
         kind, size, destroy = "Dense" if band is None else "Band", self.state.shape[1], self.sundials.SUNMatDestroy
         widths = (size,) if band is None else band[::-1]
-        matrix = create_object(self.stack, f"SUN{kind}Matrix", destroy, size, *widths, self.own)
-        linear = create_object(
-            self.stack, f"SUNLinSol_{kind}", self.sundials.SUNLinSolFree, self.vectors[0], matrix, self.own
-        )
+        matrix = self.create(f"SUN{kind}Matrix", destroy, size, *widths)
+        linear = self.create(f"SUNLinSol_{kind}", self.sundials.SUNLinSolFree, self.vectors[0], matrix)
         self.call("SetLinearSolver", linear, matrix)
         if jacobian is not None:
             self.call("SetJacFn", jacobian.address)
