@@ -10,7 +10,9 @@ NAME, PACKAGE, DRIFTS = "Radau, solve_dae, stabilised", "solve-dae", False
 
 def simulate(problem: KnownProblem, times: Array, tolerance: float) -> tuple[Array, ...]:
     """Radau of solve_dae on the stabilised equations."""
-    solve, (y0, yp0) = imported("solve_dae.integrate").solve_dae, _consistent(problem)
+    solve, zeros = imported("solve_dae.integrate").solve_dae, np.zeros(problem.n_c)
+    a, lam = problem.acceleration(problem.t_span[0], problem.q0, problem.v0)
+    y0, yp0 = np.concatenate([problem.q0, problem.v0, zeros, zeros]), np.concatenate([problem.v0, a, zeros, lam])
     options = {"method": "Radau", "t_eval": times, "rtol": tolerance, "atol": tolerance}
     solution = solve(lambda t, y, yp: _residual(problem, t, y, yp), (times[0], times[-1]), y0, yp0, **options)
     if not solution.success:
@@ -31,10 +33,3 @@ def _residual(problem: KnownProblem, t: float, y: Array, yp: Array) -> Array:
     return np.concatenate(
         [qp - v + J.T @ mu, momentum_balance, problem.constraint(t, q), J @ v + problem.constraint_rate(t, q)]
     )
-
-
-def _consistent(problem: KnownProblem) -> tuple[Array, Array]:
-    """Return consistent initial y and y'."""
-    a, lam = problem.acceleration(problem.t_span[0], problem.q0, problem.v0)
-    zeros = np.zeros(problem.n_c)
-    return np.concatenate([problem.q0, problem.v0, zeros, zeros]), np.concatenate([problem.v0, a, zeros, lam])

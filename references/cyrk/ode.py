@@ -59,8 +59,12 @@ class Configuration(ctypes.Structure):
     """The fields of ProblemConfig up to what a right-hand side is given."""
 
     _fields_ = (
-        *(("methods", POINTER), ("rate", POINTER), ("t0", REAL), ("t1", REAL)),
-        *(("start", Vector), ("given", Vector)),
+        ("methods", POINTER),
+        ("rate", POINTER),
+        ("t0", REAL),
+        ("t1", REAL),
+        ("start", Vector),
+        ("given", Vector),
     )
 
 

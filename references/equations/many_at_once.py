@@ -118,9 +118,8 @@ def by_cyrk(problems: Sequence[Problem], t_end: float) -> Solve:
         with user_call:
             for run in runs:
                 run()
-        return np.array(
-            [solver.end[:n] if solver.solution.status == FINISHED else np.full(n, np.nan) for solver in solvers[tol]]
-        )
+        finished = [(solver, solver.solution.status == FINISHED) for solver in solvers[tol]]
+        return np.array([solver.end[:n] if good else np.full(n, np.nan) for solver, good in finished])
 
     return solve
 

@@ -153,10 +153,8 @@ def _by_polynomials(build: Any, x: Any) -> list[Any]:
     for part in HALF_PI:
         rest = build.fma(turns, DOUBLE(-part), rest)
     square = build.fmul(rest, rest)
-    cubic, quartic = (
-        reduce(lambda total, c: build.fma(total, square, c), map(DOUBLE, reversed(series)))
-        for series in (SINES, COSINES)
-    )
+    polynomial = partial(reduce, lambda total, c: build.fma(total, square, c))
+    cubic, quartic = (polynomial(map(DOUBLE, reversed(series))) for series in (SINES, COSINES))
     sine = build.fma(build.fmul(square, rest), cubic, rest)
     cosine = build.fma(square, DOUBLE(-0.5), DOUBLE(1.0))
     cosine = build.fma(build.fmul(square, square), quartic, cosine)

@@ -41,13 +41,11 @@ def solve_heyoka(task: Task, tol: float = 1e-8, *, max_step: float | None = None
 def integrate(integrator: Any, start: Array, task: Task, longest: float) -> tuple[str, Array, Array, str, int]:
     """Return the integrator's name, times reached, rows y there, error message or "", and number of steps."""
     outcomes, limit, steps = imported("heyoka").taylor_outcome, TimeLimit(task.time_limit), 0
-    steps_per_call = STEPS // task.system.n_q
+    most = STEPS // task.system.n_q
     with user_call:
         integrator.time, integrator.state[:] = task.t0, start
         while True:
-            outcome, _, _, n_taken, *_ = integrator.propagate_until(
-                task.t1, max_steps=steps_per_call, max_delta_t=longest
-            )
+            outcome, _, _, n_taken, *_ = integrator.propagate_until(task.t1, max_steps=most, max_delta_t=longest)
             steps += n_taken
             if outcome != outcomes.step_limit or limit.passed():
                 break
@@ -82,10 +80,8 @@ def build_integrator(motion: list[tuple[Any, Any]], start: Any, t0: float, tol: 
 
 @lru_cache(maxsize=256)
 def _integrator(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes, tol: float) -> Any:
-    start = [*np.frombuffer(q0), *np.frombuffer(v0)]
-    return build_integrator(
-        rates_of(expressions_at(system, t0, q0, v0)), start, t0, tol, system.n_q <= LARGEST_UNROLLED
-    )
+    motion, start = rates_of(expressions_at(system, t0, q0, v0)), [*np.frombuffer(q0), *np.frombuffer(v0)]
+    return build_integrator(motion, start, t0, tol, system.n_q <= LARGEST_UNROLLED)
 
 
 HOW: dict[str, Any] = {"keeps": False, "traces": True, "builds_each": True, "one_tolerance": True}

@@ -259,10 +259,8 @@ def minimal_motion(problem: Problem, t_end: float) -> tuple[Callable[[Array], tu
     equations = minimal(problem)
     times = np.linspace(0.0, t_end, 1 + 3 * INSTANTS)
     options: dict[str, Any] = {"rtol": 1e-13, "atol": 1e-13, "dense_output": True, "max_step": t_end / INSTANTS}
-    solutions = [
-        solve_ivp(lambda t, y: equations.rates(math, y), (0.0, t_end), equations.start, method=method, **options).sol
-        for method in ("DOP853", "LSODA")
-    ]
+    given = (lambda t, y: equations.rates(math, y)), (0.0, t_end), equations.start
+    solutions = [solve_ivp(*given, method=method, **options).sol for method in ("DOP853", "LSODA")]
     q, other = (equations.states(solution(times))[0] for solution in solutions)
     return (lambda t: equations.states(solutions[0](t))), float(np.abs(q - other).max())
 

@@ -113,11 +113,6 @@ class MinimalFourBar:
         return _rate(self._lengths, self._masses, self._gravity, state, torque)  # type: ignore[no-any-return]
 
 
-def trajectory(parameters: Mapping[str, Any], times: ArrayLike) -> tuple[Array, Array]:
-    """Return states of the linkage of `four_bar(...).parameters` at `times`; see `MinimalFourBar.states`."""
-    return MinimalFourBar.from_parameters(parameters).states(times)
-
-
 _linkage = lru_cache(maxsize=64)(MinimalFourBar)  # integrated once
 
 

@@ -47,12 +47,12 @@ def solve_fully_implicit(task: Task, method: str = "Radau", rtol: float = 1e-8, 
     run = Steps.timed(task, make_solver, functions.form.start.ravel())
     with user_call:
         run.go()
-    output, counts = run.repeat_at(task.times), {}
+    (t, states), counts = run.output(task.times), {}
     if run.solver is not None:
         counts = {"n_evaluations": run.solver.nfev, "n_factorizations": run.solver.nlu}
-    name, rows = f"{method} of solve_dae", functions.form.columns(*np.split(output.states, 2))
+    name, rows = f"{method} of solve_dae", functions.form.columns(*np.split(states, 2))
     failure = run.message(name, f"{CAUSES} other tolerances.")
-    return task.result(name, output.t, rows, failure, h=np.diff(run.ends), n_accepted=len(run.ends) - 1, **counts)
+    return task.result(name, t, rows, failure, h=np.diff(run.ends), n_accepted=len(run.ends) - 1, **counts)
 
 
 class Functions:

@@ -50,16 +50,6 @@ class Steps:
         times = None if task.times is None else task.times[:0]
         return cls(make, task.t0, start, project, times, TimeLimit(task.time_limit))
 
-    @property
-    def t(self) -> Array:
-        """Return the times of the stored states."""
-        return np.array([t for t, _ in self.stored])
-
-    @property
-    def states(self) -> Array:
-        """Return the stored states, one per column."""
-        return np.array([y for _, y in self.stored]).reshape(-1, self.start.size).T
-
     def go(self) -> None:
         """Integrate to the end or to a failure."""
         self.ends.append(self.t0)
@@ -79,16 +69,16 @@ class Steps:
                 raise
             self.failure = str(error)
 
-    def repeat_at(self, times: Array | None) -> "Steps":
-        """Return the same steps, untimed, with the states at the given times that were reached; itself for None."""
-        if times is None:
-            return self
-        reached = times[times <= self.ends[-1]]
-        steps = Steps(self.make, self.t0, self.start, self.project, reached, TimeLimit(None))
-        if times[0] <= self.ends[-1]:
-            steps.go()
-        self.failure = self.failure or steps.failure
-        return steps
+    def output(self, times: Array | None) -> tuple[Array, Array]:
+        """Return the given times that were reached, by the same steps, untimed, or those stored; states as columns."""
+        stored = self.stored
+        if times is not None:
+            reached = times[times <= self.ends[-1]]
+            steps = Steps(self.make, self.t0, self.start, self.project, reached, TimeLimit(None))
+            if reached.size:
+                steps.go()
+            self.failure, stored = self.failure or steps.failure, steps.stored
+        return np.array([t for t, _ in stored]), np.array([y for _, y in stored]).reshape(-1, self.start.size).T
 
     def message(self, name: str, advice: str) -> str:
         """Return the message of a failure; "" if there was none."""
@@ -238,9 +228,9 @@ def solve_index1(
     counts = {"n_accepted": len(run.ends) - 1, "n_evaluations": int(equations.counters[0])}
     if isinstance(run.solver, Radau | BDF):
         counts["n_factorizations"] = run.solver.nlu
-    output = run.repeat_at(task.times)
-    rows = np.concatenate([output.states, *equations.at_points(output.t, output.states, equations.alpha)])
-    return task.result(method, output.t, rows, run.message(method, ADVICE), h=np.diff(run.ends), **counts)
+    t, states = run.output(task.times)
+    rows = np.concatenate([states, *equations.at_points(t, states, equations.alpha)])
+    return task.result(method, t, rows, run.message(method, ADVICE), h=np.diff(run.ends), **counts)
 
 
 class RightHandSide(Equations):

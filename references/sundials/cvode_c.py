@@ -282,14 +282,12 @@ def _memory(stack: ExitStack, functions: Functions, start: Array, task: Task, me
     return solver
 
 
+PROJECTED = {"method": "BDF", "projected": True}
 LINES = (
     Line("CVODE, Adams", "scikit-sundae", "SUNDIALS", solve_cvode, called_from="Python", keeps=False, checked=True),
     Line("CVODE from C, Adams", "scikit-sundae", "SUNDIALS", solve_cvode_c, keeps=False, checked=True, traces=True),
     Line("CVODE from C, BDF", "scikit-sundae", "SUNDIALS", solve_cvode_c, {"method": "BDF"}, keeps=False, traces=True),
     Line(
-        *("CVODE from C, BDF, projected", "scikit-sundae", "SUNDIALS", solve_cvode_c),
-        {"method": "BDF", "projected": True},
-        checked=True,
-        traces=True,
+        "CVODE from C, BDF, projected", "scikit-sundae", "SUNDIALS", solve_cvode_c, PROJECTED, checked=True, traces=True
     ),
 )

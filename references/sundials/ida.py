@@ -81,10 +81,8 @@ def states_at(solver: Any, span: tuple[float, float], times: Array, *start: Arra
         outputs += [solver.step(stop, tstop=t1) for stop in times[times > t0].tolist()]
     if not (times.size and times[0] == t0):
         outputs = outputs[1:]
-    size = start[0].size
-    y, yp = (
-        np.array([getattr(output, name, output.y) for output in outputs]).reshape(-1, size) for name in ("y", "yp")
-    )
+    shape = -1, start[0].size
+    y, yp = (np.array([getattr(each, name, each.y) for each in outputs]).reshape(shape) for name in ("y", "yp"))
     return SimpleNamespace(t=times, y=y, yp=yp)
 
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 from numba.core.dispatcher import Dispatcher
-from numpy.typing import NDArray
+from scipy.optimize._numdiff import group_columns
 from scipy.sparse import bmat, coo_array, csc_array, eye_array
 
 from references.driver import CAUSES, Task, TimeLimit, adapter, imported, user_call
@@ -40,7 +40,8 @@ def solve_ida_sparse(task: Task, rtol: float = 1e-8, atol: float = 1e-8) -> Resu
     space = *entries, np.zeros(entries[0].size), np.zeros(entries[2].size)
 
     pattern = pattern_of_residual(system)
-    groups, matrix = groups_of(pattern), _matrix_of(residual)
+    # of each column; columns of a group have no common row
+    groups, matrix = group_columns(pattern, np.arange(pattern.shape[1])), _matrix_of(residual)
 
     def resfn(t, y, yp, res):  # type: ignore[no-untyped-def]
         residual(n, t, np.array(y), np.array(yp), f.p, *space, res)  # copies of read-only arrays
@@ -89,19 +90,8 @@ def pattern_of_residual(system: ConstrainedSystem) -> csc_array:
     ]
     pattern = csc_array(bmat(blocks) != 0.0)
     # 64-bit indices make scikit-sundae corrupt the heap
-    return csc_array(
-        (pattern.data, pattern.indices.astype(np.int32), pattern.indptr.astype(np.int32)), shape=pattern.shape
-    )
-
-
-def groups_of(pattern: csc_array) -> NDArray[np.int64]:
-    """Return the group of each column (n,), such that columns of a group have no common row."""
-    near = csc_array(pattern.T @ pattern)
-    groups = np.full(near.shape[1], -1)
-    for j in range(groups.size):
-        used = set(groups[near.indices[near.indptr[j] : near.indptr[j + 1]]].tolist())
-        groups[j] = next(g for g in range(len(used) + 1) if g not in used)
-    return groups
+    places = pattern.indices.astype(np.int32), pattern.indptr.astype(np.int32)
+    return csc_array((pattern.data, *places), shape=pattern.shape)
 
 
 @lru_cache(maxsize=8)

@@ -200,16 +200,11 @@ class Memory:
             return limit.message(name, t, "take looser tolerances")
         if flag >= 0:
             return ""
-        return f"{name} failed after t = {t:.10g} with {self.flag_name(flag)} ({flag}). {advice}"
-
-    def flag_name(self, flag: int) -> str:
-        """Return SUNDIALS' name of a flag; the caller must free the text."""
-        text = getattr(self.sundials, f"{self.kind}GetReturnFlagName")(flag)
-        name = ctypes.string_at(text).decode()
-        free = ctypes.CDLL(None).free
+        text, free = getattr(self.sundials, f"{self.kind}GetReturnFlagName")(flag), ctypes.CDLL(None).free
+        flag_name = ctypes.string_at(text).decode()
         free.argtypes, free.restype = [POINTER], None
-        free(text)
-        return name
+        free(text)  # as the caller must
+        return f"{name} failed after t = {t:.10g} with {flag_name} ({flag}). {advice}"
 
 
 def run(

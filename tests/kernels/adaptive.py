@@ -5,7 +5,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from references.paper.four_bar_minimal import trajectory
+from references.paper.four_bar_minimal import MinimalFourBar
 from tests import problems
 from twoloop import solve_dae
 
@@ -18,7 +18,7 @@ def four_bar_run(method, tol, end=10.0, linkage="default", **options):
     problem = problems.LINKAGES[linkage]
     result = problems.run(problem, end, method=method, rtol=tol, atol=tol, compiled=False, **options)
     assert result.success, result.message
-    return result, problems.worst(result.q, trajectory(problem.parameters, result.t)[0])
+    return result, problems.worst(result.q, MinimalFourBar.from_parameters(problem.parameters).states(result.t)[0])
 
 
 shared_run = cache(four_bar_run)  # for runs that several tests look at

@@ -11,7 +11,7 @@ pytest.importorskip("exudyn")
 
 from references.exudyn.mechanisms import MODELS, has_model, solve_exudyn
 from references.exudyn.model import SOLVERS
-from references.paper.four_bar_minimal import trajectory
+from references.paper.four_bar_minimal import MinimalFourBar
 from studies.validation import study as validation
 from tests.marks import slow, slow_but
 from tests.problems import LINKAGES
@@ -34,7 +34,7 @@ BOUNDS = {
 
 
 def final_error(result, name):
-    q, v = trajectory(LINKAGES[name].parameters, result.t[-1:])
+    q, v = MinimalFourBar.from_parameters(LINKAGES[name].parameters).states(result.t[-1:])
     return np.abs(result.q[:, -1] - q[:, 0]).max(), np.abs(result.v[:, -1] - v[:, 0]).max()
 
 

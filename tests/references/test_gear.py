@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from references.paper.four_bar_minimal import trajectory
+from references.paper.four_bar_minimal import MinimalFourBar
 from references.paper.gear import HIGHEST, STARTS, _formulas, solve_gear
 from tests.problems import force_residual, violations, worst
 from twoloop.mechanisms import four_bar
@@ -17,7 +17,7 @@ def run(t_end, step, order, **options):
 
 def slopes(order, steps, **options):
     """Observed orders of q and v at 0.6 s."""
-    q, v = trajectory(PROBLEM.parameters, [0.6])
+    q, v = MinimalFourBar.from_parameters(PROBLEM.parameters).states([0.6])
     ends = [run(0.6, step, order, **options) for step in steps]
     errors = np.array([[worst(r.q[:, -1], q[:, 0]), worst(r.v[:, -1], v[:, 0])] for r in ends])
     return np.log(errors[0] / errors[-1]) / np.log(steps[0] / steps[-1])

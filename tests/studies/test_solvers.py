@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from references.paper.four_bar_minimal import trajectory
+from references.paper.four_bar_minimal import MinimalFourBar
 from references.scipy.index1 import baumgarte
 from studies.bench.collector import Case
 from studies.bench.headline import OWN_CODE
@@ -38,7 +38,7 @@ def test_every_solver_runs_at_one_setting(name):
     result = CATALOGUE[name].run(Case("four-bar", problem, T_END), setting(name), 0)
     assert result.success and result.t[-1] == pytest.approx(T_END)
     bound = 0.02 if ", order 1" in name else 1e-3  # implicit Euler
-    assert np.abs(result.q - trajectory(problem.parameters, result.t)[0]).max() < bound
+    assert np.abs(result.q - MinimalFourBar.from_parameters(problem.parameters).states(result.t)[0]).max() < bound
 
 
 @pytest.mark.parametrize("name", [f"Exudyn, {solver}" for solver in EXUDYN])
