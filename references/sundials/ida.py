@@ -244,33 +244,35 @@ def _compiled(parts: Parts, n: int, m: int, n_p: int, widths: tuple[int, int] | 
 
     @cfunc(types.int32(types.float64, pointer, pointer, pointer, pointer), **OPTIONS)
     def residual_of_ida(t, y, yp, res, memory):  # type: ignore[no-untyped-def]
+        p, M, Cq, _, _, _, _ = space(memory)
         try:
             if banded:
                 order, own_y, own_yp, own_res, _ = in_order(memory, vector(y), vector(yp))
-                residual(t, own_y, own_yp, *space(memory)[:3], own_res)
+                residual(t, own_y, own_yp, p, M, Cq, own_res)
                 out = vector(res)
                 for k in range(size):
                     out[k] = own_res[int(order[k])]
             else:
-                residual(t, vector(y), vector(yp), *space(memory)[:3], vector(res))
+                residual(t, vector(y), vector(yp), p, M, Cq, vector(res))
         except Exception:
             return RAISED
         return 0
 
     @cfunc(types.int32(types.float64, types.float64, *[pointer] * 8), **OPTIONS)
     def jacobian_of_ida(t, cj, y, yp, res, J, memory, work1, work2, work3):  # type: ignore[no-untyped-def]
+        p, M, Cq, K, moved, here, there = space(memory)
         columns = carray(matrix_of(J), (size, depth))  # initialised to zero by IDA
         try:
             if banded:
                 order, own_y, own_yp, _, dense = in_order(memory, vector(y), vector(yp))
                 dense[:, :] = 0.0
-                iteration_matrix(t, cj, own_y, own_yp, *space(memory), dense)
+                iteration_matrix(t, cj, own_y, own_yp, p, M, Cq, K, moved, here, there, dense)
                 for j in range(size):  # an entry outside the band, were there one, would only slow Newton's method
                     column_in_order, column = dense[int(order[j])], columns[j]
                     for i in range(max(0, j - upper), min(size, j + lower + 1)):
                         column[above + i - j] = column_in_order[int(order[i])]
             else:
-                iteration_matrix(t, cj, vector(y), vector(yp), *space(memory), columns)
+                iteration_matrix(t, cj, vector(y), vector(yp), p, M, Cq, K, moved, here, there, columns)
         except Exception:
             return RAISED
         return 0
