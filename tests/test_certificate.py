@@ -13,6 +13,7 @@ import pytest
 from tests.compiled import PENDULUM
 from tests.problems import at_one, quick, run
 from twoloop import CertificateWarning, ConstrainedSystem, Newmark, Statistics, callback, mechanisms, solve_dae
+from twoloop.bodies import PlanarModel
 
 END, COLUMNS = 3.0, ("t", "q", "v", "a", "lam")
 
@@ -114,6 +115,16 @@ def test_constant_steps_are_measured_by_the_tolerance_that_is_asked_for(default_
 def test_a_run_that_an_event_ended(default_four_bar):
     for options in ({}, {"dense_output": True}, {"t_eval": np.linspace(0.0, 5.0, 51)}):
         assert silently(run(default_four_bar, 5.0, events=at_one(True), **options))
+
+
+@pytest.mark.parametrize("method", ["auto", "DOP853"])
+def test_rounding_errors_of_accelerations_in_an_equilibrium_are_none_of_the_result(method):
+    model = PlanarModel(gravity=(0.0, -9.81))
+    for k in range(2):
+        model.rod(str(k), (0.0, -k), (0.0, -k - 1.0), mass=2.0 - k)
+        model.revolute(str(k - 1) if k else "ground", str(k), at=(0.0, -k))
+    p = model.problem((0.0, 0.5))
+    assert silently(solve_dae(p.system, p.t_span, p.q0, p.v0, method, 1e-10, 1e-10))
 
 
 @pytest.mark.parametrize(("method", "tolerance"), [("TRBDF2", 1e-6), ("ESDIRK4", 1e-6), ("auto", 1e-4), ("auto", 1e-9)])

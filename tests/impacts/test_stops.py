@@ -455,6 +455,18 @@ def test_an_impact_that_would_add_energy_is_refused():
 NO_TANGENTS = Tangents(np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros(0, dtype=np.int64))
 
 
+def test_a_drive_that_moves_a_body_into_a_stop_is_named():
+    model = PlanarModel(gravity=(0.0, 0.0))
+    model.body("slider", mass=1.0, inertia=1.0, position=(0.0, 0.0))
+    guide = model.prismatic("ground", "slider", at=(0.0, 0.0), axis=(1.0, 0.0))
+    model.drive(guide, lambda t: 0.3 * t)
+    model.stop("slider", (0.0, 0.0), "ground", (0.1, 0.0), normal=(-1.0, 0.0), restitution=0.5)
+    p = model.problem((0.0, 1.0))
+    result = solve_with_stops(p.system, p.t_span, p.q0, p.v0, p.stops)
+    assert not result.success and "move a body into a stop" in result.message
+    assert result.t[-1] == pytest.approx(1.0 / 3.0, abs=1e-8)
+
+
 @pytest.mark.parametrize("law", [None, "moreau"])
 def test_a_light_and_a_heavy_body_hit_stops_together(law):
     system = unconstrained(lambda t, q, v: np.zeros(4), 4, mass=np.diag([1e6, 1e6, 1e-12, 1e-12]))

@@ -18,6 +18,7 @@ NEAR = 1e-9  # times count as equal if they differ by at most this, relative to 
 ROUNDING = 1e-9  # deviation attributed to rounding, relative to the largest acceleration or multiplier
 SINGULAR_START = 1e-5  # largest error of the accelerations at a start in a singular position, relative to the largest
 LIMIT_OF_A = 10.0  # a and lam may be off by what errors of this many tolerances in the stored state can cause
+MIN_EFFECT = 1e-6  # smallest effect of errors of the state on an a or lam, relative to the largest on one of these
 PATTERNS = 3  # number of sign patterns of the perturbations by which the effect of a tolerance is measured
 
 
@@ -144,10 +145,16 @@ def _acceleration_faults(result: Record, system: ConstrainedSystem, rtol: float,
             with np.errstate(invalid="ignore"):
                 effect = np.fmax(effect, np.abs(evaluate(t + sign * shift, states + sign * signs * change) - exact))
     largest = np.nanmax(np.abs(exact), axis=0, initial=0.0)
-    magnitudes = np.concatenate(
-        [np.full(n, largest[:n].max(initial=0.0)), np.full(len(largest) - n, largest[n:].max(initial=0.0))]
+    # in an equilibrium, accelerations are differences of forces, so that the free ones count as their magnitude, too
+    inertia = np.diagonal(system.mass(float(t[0]), states[0, :n]))
+    forces = np.abs(system.force(float(t[0]), *states[0].reshape(2, n)))
+    largest[:n] = np.maximum(largest[:n], np.divide(forces, inertia, out=np.zeros(n), where=inertia > 0.0))
+    groups = np.arange(len(largest)) >= n  # False: a, True: lam
+    magnitudes, strongest = (
+        np.where(groups, each[groups].max(initial=0.0), each[:n].max(initial=0.0))
+        for each in (largest, np.nanmax(effect, axis=0, initial=0.0))
     )
-    allowed = LIMIT_OF_A * effect + ROUNDING * magnitudes
+    allowed = LIMIT_OF_A * effect + ROUNDING * magnitudes + MIN_EFFECT * strongest
     with np.errstate(invalid="ignore"):
         deviation = np.abs(stored - exact)
         is_wrong = np.isfinite(exact) & ~(deviation <= allowed)
