@@ -476,6 +476,14 @@ def test_a_light_and_a_heavy_body_hit_stops_together(law):
     np.testing.assert_allclose(result.v[:, -1], [0.5, 0.6 - 0.2 * 1.5] * 2, atol=1e-9)
 
 
+def test_friction_near_the_coefficient_at_which_a_stop_jams():
+    D, c = np.array([[0.714, -2.224], [-2.224, 6.968]]), np.array([-0.920, -2.062])
+    x, slides = coulomb_forces(D, c, np.zeros(0), Tangents(np.array([0]), np.array([0.3]), np.array([0])))
+    load = 0.920 / (0.714 - 0.3 * 2.224)  # the stop pushes, and slides: 0.714 load - 2.224 (0.3 load) = 0.920
+    np.testing.assert_allclose(x, [load, 0.3 * load], rtol=1e-9)
+    assert slides == [-1]
+
+
 @pytest.mark.parametrize("joints", [0, 2])
 def test_stops_that_depend_on_one_another_keep_their_conditions(joints):
     """Up to four stops in two directions, whose rates need not fit together, with joints that friction holds."""
