@@ -28,6 +28,7 @@ EVEN_WEIGHT = 1e-6  # relative weight of the regularisation that distributes a s
 SOLVER_SCALE = 1e3  # factor on the equations, so that their gradients exceed the tolerance of the solver
 MAX_SOLVER_ITERATIONS = 1000
 MAX_LOAD_ITERATIONS = 2000  # largest number of fixed-point iterations for the loads that bound the friction
+MAX_GROWTH = 1e9  # the iteration diverges if a change of the forces exceeds this times the first change
 LOAD_TOLERANCE = 1e-10  # change of the loads that ends the fixed-point iteration, relative to the largest load
 UNIT_RATIO = 256.0  # units of forces are powers of this number, so that they are all 1 for similar bodies
 MAX_OUTSIDE = 1e-9  # largest component of b outside the range of D that counts as rounding, relative to max|b|
@@ -132,6 +133,7 @@ def _forces_in_units(D: Array, c: Array, limit: Array, tangents: Tangents) -> tu
     is_sliding = tangents.sign != 0
     unknown_rows = np.setdiff1d(np.arange(len(c)), tangent_rows[is_sliding])
     x, tolerance = np.zeros(len(c)), NEGLIGIBLE_RATIO * np.abs(c).max(initial=0.0) / D.diagonal().max(initial=1e-300)
+    first_change = 0.0
     for _ in range(MAX_LOAD_ITERATIONS):
         new_x, load = np.zeros(len(c)), tangents.coefficient * x[tangents.normal]
         new_x[tangent_rows] = -tangents.sign * load
@@ -139,9 +141,11 @@ def _forces_in_units(D: Array, c: Array, limit: Array, tangents: Tangents) -> tu
         D_kept = D[np.ix_(unknown_rows, unknown_rows)]
         new_x[unknown_rows] = holding_forces(D_kept, right_side, n, bounds)
         change, x = np.abs(new_x - x).max(), new_x
-        if change <= LOAD_TOLERANCE * np.abs(x).max() + tolerance:
+        first_change = first_change or change
+        has_converged = change <= LOAD_TOLERANCE * np.abs(x).max() + tolerance
+        if has_converged or change > MAX_GROWTH * first_change:
             break
-    else:
+    if not has_converged:
         raise Undetermined("friction of stops is so large that their forces are not determined: they may jam")
     acceleration, terms = D @ x + c, np.abs(D) @ np.abs(x) + np.abs(c)
     if not n_tangents:
