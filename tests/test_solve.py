@@ -134,8 +134,8 @@ def test_price_and_accuracy_of_the_papers_method_over_100_s(default_four_bar):
     assert violations(default_four_bar.system, result)[0] < 1e-9
     energy = default_four_bar.energy(result.t, result.q, result.v)
     assert worst(energy, energy[0]) < 1e-2
-    known = MinimalFourBar.from_parameters(default_four_bar.parameters).states([100.0])[0][:, 0]
-    assert worst(result.q[:, -1], known) < 1e-2
+    expected = MinimalFourBar.from_parameters(default_four_bar.parameters).states([100.0])[0][:, 0]
+    assert worst(result.q[:, -1], expected) < 1e-2
 
 
 VARIES = ("Adams", True)  # keeps no constant step

@@ -174,9 +174,10 @@ def freedoms(body: Body, joint: ModelJoint) -> list[tuple[str, Array]]:
 
 def springs(model: Any) -> list[tuple[Body, Array, Body, Array, tuple[float, ...]]]:
     """Return both ends of each spring in body axes, with stiffness, damping and length."""
-    found = [f for f in model.forces if f.kind == SPRING]
     return [
-        (f.first, np.array(f.on_first.values), f.second, np.array(f.on_second.values), f.more.values) for f in found
+        (f.first, np.array(f.on_first.values), f.second, np.array(f.on_second.values), f.more.values)
+        for f in model.forces
+        if f.kind == SPRING
     ]
 
 

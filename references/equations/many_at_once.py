@@ -145,9 +145,9 @@ def by_cvode(problems: Sequence[Problem], t_end: float) -> Solve:
 
 def _tasks(problems: Sequence[Problem], t_end: float) -> tuple[list[Task], list[tuple[Any, ...]]]:
     """Return the tasks of runs that are made singly, and the key of the equations of each: one, if parameters agree."""
-    given = [(problem.system, problem.q0, problem.v0) for problem in problems]
-    tasks = [Task(with_all_rows(system), system.n_c, 0.0, t_end, q0, v0) for system, q0, v0 in given]
-    alike = all((system.parameters == problems[0].system.parameters).all() for system, _, _ in given)
+    starts = [(problem.system, problem.q0, problem.v0) for problem in problems]
+    tasks = [Task(with_all_rows(system), system.n_c, 0.0, t_end, q0, v0) for system, q0, v0 in starts]
+    alike = all((system.parameters == problems[0].system.parameters).all() for system, _, _ in starts)
     return tasks, [tasks[0].key if alike else task.key for task in tasks]
 
 

@@ -259,8 +259,8 @@ def minimal_motion(problem: Problem, t_end: float) -> tuple[Callable[[Array], tu
     equations = minimal(problem)
     times = np.linspace(0.0, t_end, 1 + 3 * INSTANTS)
     options: dict[str, Any] = {"rtol": 1e-13, "atol": 1e-13, "dense_output": True, "max_step": t_end / INSTANTS}
-    given = (lambda t, y: equations.rates(math, y)), (0.0, t_end), equations.start
-    solutions = [solve_ivp(*given, method=method, **options).sol for method in ("DOP853", "LSODA")]
+    motion = (lambda t, y: equations.rates(math, y)), (0.0, t_end), equations.start
+    solutions = [solve_ivp(*motion, method=method, **options).sol for method in ("DOP853", "LSODA")]
     q, other = (equations.states(solution(times))[0] for solution in solutions)
     return (lambda t: equations.states(solutions[0](t))), float(np.abs(q - other).max())
 
@@ -321,8 +321,8 @@ def solve_heyoka_minimal(equations: Minimal, task: Task, tol: float = 1e-8) -> t
 def solve_cvode_minimal(equations: Minimal, task: Task, rtol: float = 1e-8, atol: float = 1e-8) -> tuple[Any, ...]:
     """Integrate a mechanism in minimal coordinates by CVODE's Adams methods, driven from C."""
     functions = cvode_c.Functions(_right_hand_side(equations, cvode_c.right_hand_side))
-    given = functions, np.array(equations.start), task, "Adams", rtol, atol, task.longest(None)
-    return "CVODE, Adams,", *cvode_c.integrate(*given)
+    arguments = functions, np.array(equations.start), task, "Adams", rtol, atol, task.longest(None)
+    return "CVODE, Adams,", *cvode_c.integrate(*arguments)
 
 
 @_adapter
@@ -331,8 +331,8 @@ def solve_cyrk_minimal(
 ) -> tuple[Any, ...]:
     """Integrate a mechanism in minimal coordinates by one of CyRK's explicit methods, "DOP853" or "Vern8"."""
     functions = _right_hand_side(equations, ode.right_hand_side), None
-    given = functions, np.array(equations.start), task, method, rtol, atol, task.longest(None)
-    return f"CyRK, {method},", *ode.integrate(*given)
+    arguments = functions, np.array(equations.start), task, method, rtol, atol, task.longest(None)
+    return f"CyRK, {method},", *ode.integrate(*arguments)
 
 
 @lru_cache(maxsize=256)

@@ -153,8 +153,8 @@ class Draft:
         for name, part in self.files.items():
             (folder / name).write_text(part)
         ending = "xml" if self.form == "MJCF" else "urdf"
-        ours, theirs = (folder / f"{name}.{ending}" for name in ("model", "reference"))
-        ours.write_text(self.text)
+        model, reference = (folder / f"{name}.{ending}" for name in ("model", "reference"))
+        model.write_text(self.text)
         text = self.text
         for name in self.balls:  # in the other file these are types=
             text = text.replace(f'"{name}" type="fixed"', f'"{name}" type="spherical"')
@@ -162,5 +162,5 @@ class Draft:
         if self.used & {"massless body", "massless link"}:
             more += TINY if self.form == "MJCF" else f"<mujoco>{TINY}</mujoco>"
         end = text.rfind("</")
-        theirs.write_text(text[:end] + more + text[end:])
-        return ours, theirs
+        reference.write_text(text[:end] + more + text[end:])
+        return model, reference

@@ -291,6 +291,19 @@ def test_an_impact_on_a_chain_in_space_keeps_its_joints(rotation):
     assert np.abs(problem.system.velocity_constraint(hit.t, q, hit.v_after)).max() < 1e-9
 
 
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_an_impact_on_a_body_turned_by_half_a_turn(axis):
+    """An Euler parameter is zero to rounding there, with no inertia."""
+    turned, J = Rotation.from_rotvec(np.pi * np.eye(3)[axis]).as_matrix(), np.array([0.1, 0.07, 0.09])
+    model = SpatialModel((0.0, 0.0, 0.0))
+    model.body("box", mass=1.0, inertia=J, position=(0.0, 0.0, 0.4), rotation=turned, velocity=(0.3, 0.1, -1.0))
+    model.stop("box", (0.5, -0.3, 0.01), "ground", (0.0, 0.0, 0.0), normal=(0.0, 0.0, 1.0), restitution=0.5)
+    _, result = moved(model, 0.02)
+    lever = turned.T @ np.cross((0.5, -0.3, -0.39), (0.0, 0.0, 1.0))  # in body axes
+    impulse = 1.5 / (1.0 + lever @ (lever / J))
+    np.testing.assert_allclose(result.impacts[0].v_after[:3], [0.3, 0.1, -1.0 + impulse], rtol=1e-9)
+
+
 def test_a_linkage_with_a_redundant_row_comes_to_rest_at_a_stop():
     model = PlanarModel(gravity=(0.0, 0.0))
     model.rod("bar", (0.6, 0.8), (2.6, 0.8), mass=2.0)

@@ -29,8 +29,8 @@ def solve_exudyn_beam(
     `ancf_beam`; NaN where the model has no such quantity: the directors, with "shear" also the slopes. So is `lam`.
     """
     steps = check_steps(problem, t_end, n_steps, solver, store_every, time_limit)
-    made = _model(problem.parameters, model)
-    n_nodes = len(made.reference)
+    beam = _model(problem.parameters, model)
+    n_nodes = len(beam.reference)
     kept = 4 if model == "cable" else 2  # of x, y, slopes the first model has all, the second x, y and an angle
 
     def among_six(coordinates):
@@ -39,7 +39,7 @@ def solve_exudyn_beam(
         inserted[:, :kept] = coordinates.reshape(n_nodes, -1, coordinates.shape[1])[:, :kept]
         return inserted.reshape(-1, coordinates.shape[1])
 
-    return run(made, steps, lambda q, v, a: (among_six(q), among_six(v), among_six(a)))
+    return run(beam, steps, lambda q, v, a: (among_six(q), among_six(v), among_six(a)))
 
 
 def _model(p, model):

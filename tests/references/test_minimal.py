@@ -81,8 +81,8 @@ SOLVERS = {
 
 def motion(problem, t_end):
     own = minimal(problem)
-    made = solve_ivp(lambda t, y: own.rates(math, y), (0.0, t_end), own.start, "DOP853", rtol=1e-13, atol=1e-14)
-    return made.t, *own.states(made.y)
+    solution = solve_ivp(lambda t, y: own.rates(math, y), (0.0, t_end), own.start, "DOP853", rtol=1e-13, atol=1e-14)
+    return solution.t, *own.states(solution.y)
 
 
 @pytest.mark.parametrize("name", MAKE)
@@ -115,8 +115,8 @@ def test_the_motion_is_the_problems(name):
 def test_any_four_bar_with_an_angle_clear_of_its_dead_centres(given, far):
     problem = mechanisms.four_bar(**given)
     t, q, v = motion(problem, 5.0)  # more than two periods
-    known = MinimalFourBar.from_parameters(problem.parameters).states(t)
-    assert np.abs(q - known[0]).max() < far and np.abs(v - known[1]).max() < 10.0 * far
+    expected = MinimalFourBar.from_parameters(problem.parameters).states(t)
+    assert np.abs(q - expected[0]).max() < far and np.abs(v - expected[1]).max() < 10.0 * far
 
 
 @pytest.mark.parametrize("which", SOLVERS)

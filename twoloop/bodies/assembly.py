@@ -111,11 +111,9 @@ def velocities(
     if free.shape[1] and is_given.any():
         block = free[is_given]
         v = v + free @ np.linalg.lstsq(block, (target - v)[is_given], rcond=SINGULAR)[0]
-        free = free @ null_space(block, rcond=SINGULAR)
-    if free.shape[1]:
-        mass, held = system.mass(t, q), np.vstack([rows, np.eye(system.n_q)[is_given]])
-        impulses = -mass @ (v * scales.columns)
-        v = v + velocity_changes(mass, held, impulses[:, None], np.zeros((len(held), 1)))[:, 0] / scales.columns
+    mass, held = system.mass(t, q), np.vstack([rows, np.eye(system.n_q)[is_given]])
+    impulses = -mass @ (v * scales.columns)
+    v = v + velocity_changes(mass, held, impulses[:, None], np.zeros((len(held), 1)))[:, 0] / scales.columns
     off = np.where(is_given, np.abs(v - target), 0.0)
     if off.max(initial=0.0) > max(VELOCITY_CHANGE * size, SINGULAR * speed, REST):
         j = int(off.argmax())

@@ -51,13 +51,13 @@ def certainly_exceed(ratio: float, rows: Array, rank: int) -> bool:
     return bool(ratio * float(np.linalg.norm(rows)) * inverse < 1.0)
 
 
-def redundant_rows(scaled: Array) -> list[int]:
+def redundant_rows(scaled: Array, tolerance: float = RANK_TOLERANCE) -> list[int]:
     """Return the rows of a Jacobian, scaled to similar size, that depend on the others, by QR with pivoting."""
     if scaled.size == 0:
         return []
     R, order = qr(scaled.T, mode="r", pivoting=True)
     diagonal = np.abs(np.diagonal(R))
-    rank = int((diagonal > RANK_TOLERANCE * diagonal.max()).sum())
+    rank = int((diagonal > tolerance * diagonal.max()).sum())
     return sorted(order[rank:].tolist())
 
 

@@ -136,7 +136,8 @@ class ContactSystem:
         self._system, self._gaps, self._closed = system, gaps, closed
         self._slides, self._sticking, self._slipping = slides, list(sticking), slipping
         self._offsets = np.array(list(sticking.values()))
-        self._units: Array | None = None  # found by the first call of `force`
+        # of the equations with friction, found by the first call of `force`: units, whether rows are redundant
+        self._scaling: tuple[Array, bool] | None = None
         self._zero_velocity = np.zeros(system.n_q)
         self._derived = derive_callbacks(system, accept_traces)[0] if slipping else system
 
@@ -187,10 +188,9 @@ class ContactSystem:
         for place, k, coefficient in self._slipping:
             K[:n, first_stop + place] -= coefficient * slides[k]
         right = np.concatenate([Q, *right_sides, -self._rows("bias", t, q, v)])[:, None]
-        if self._units is None:
-            self._units = equilibrating_units(K, n)
-        is_singular = len(independent_rows(rows)) < len(rows)
-        forces = solve_scaled(K, right, self._units, is_singular)[first_stop:, 0]
+        if self._scaling is None:
+            self._scaling = equilibrating_units(K, n), len(independent_rows(rows)) < len(rows)
+        forces = solve_scaled(K, right, *self._scaling)[first_stop:, 0]
         return Q + sum(coefficient * forces[place] * slides[k] for place, k, coefficient in self._slipping)
 
     def build(self, names: str) -> ConstrainedSystem:

@@ -13,7 +13,7 @@ from twoloop.checks.arguments import Array
 from twoloop.impacts.contact import Gap, Gaps
 from twoloop.problem.description import Stop
 from twoloop.problem.system import ConstrainedSystem
-from twoloop.run.fallbacks import NEGLIGIBLE_RATIO, velocity_changes
+from twoloop.run.fallbacks import NEGLIGIBLE_RATIO, independent_rows, velocity_changes
 
 if TYPE_CHECKING:
     from twoloop.bodies.model_problem import ModelProblem
@@ -23,7 +23,6 @@ STICKS, IDLE = 0, None  # states of a joint at rest: STICKS, held by its own fri
 MIN_COMPLIANCE = 1e-9  # smallest ratio of compliances, other joints held / free, of a joint that can slide by itself
 REST_RATE = 1e-10  # largest rate that counts as zero, relative to the largest velocities of the last arc
 COUPLING_TOLERANCE = 1e-6  # largest error with which a coefficient between two displacements counts as 0, 1 or -1
-HELD = 1e-14  # a row is held if its compliance is at most this times that without constraints: a rounding error
 EVEN_WEIGHT = 1e-6  # relative weight of the regularisation that distributes a shared load evenly
 SOLVER_SCALE = 1e3  # factor on the equations, so that their gradients exceed the tolerance of the solver
 MAX_SOLVER_ITERATIONS = 1000
@@ -50,11 +49,12 @@ class Tangents(NamedTuple):
 
 def responses(system: ConstrainedSystem, t: float, q: Array, W: Array) -> Array:
     """Return X (n_q, k), changes of velocities by unit impulses along rows W: M X + G^T Y = W^T, with G X = 0."""
-    rows, mass = system.rows(t, q), system.mass(t, q)
-    X = velocity_changes(mass, rows, W.T, np.zeros((len(rows), len(W))))
-    inertia = np.diagonal(mass)
-    compliances = W**2 @ np.where(inertia > 0.0, 1.0 / np.where(inertia > 0.0, inertia, 1.0), 0.0)  # without G
-    X[:, (W * X.T).sum(axis=1) <= HELD * compliances] = 0.0  # joints and drives hold this row
+    rows = system.rows(t, q)
+    X = velocity_changes(system.mass(t, q), rows, W.T, np.zeros((len(rows), len(W))))
+    rank = len(independent_rows(rows))
+    for k, row in enumerate(W):
+        if len(independent_rows(np.vstack([rows, row]))) == rank:  # joints and drives hold this row: no rounding errors
+            X[:, k] = 0.0
     return X
 
 
@@ -108,14 +108,14 @@ def coulomb_forces(D: Array, c: Array, limit: Array, tangents: Tangents) -> tupl
     The forces of stops are non-negative and complementary to the accelerations (or velocities) D x + c. Friction
     opposes sliding with its coefficient times the force of the stop; at rest, this product is a bound.
     """
-    # forces of light and heavy bodies are found in units in which they are similar; a stop and its friction share one
-    n_tangents = len(tangents.normal)
-    n, compliances = len(c) - len(limit) - n_tangents, D.diagonal()
+    n_tangents, compliances = len(tangents.normal), D.diagonal()
+    n = len(c) - len(limit) - n_tangents
     if (c[:n][compliances[:n] == 0.0] < -CLOSING_TOLERANCE * np.abs(c).max(initial=0.0)).any():
         raise Undetermined("joints or drives move a body into a stop, which no force of the stop can prevent")
     if not compliances.any():
         return np.zeros(len(c)), np.sign(c[len(c) - n_tangents :]).astype(int)
-    units = np.where(D.diagonal() > 0.0, D.diagonal(), 1.0) ** -0.5
+    # in these units, forces of light and heavy bodies are similar; a stop and its friction share one
+    units = np.where(compliances > 0.0, compliances, 1.0) ** -0.5
     units[len(c) - n_tangents :] = units[tangents.normal]
     units = UNIT_RATIO ** np.round(np.log2(units) / np.log2(UNIT_RATIO))
     x, slides = _forces_in_units(D * units * units[:, None], units * c, limit / units[n : n + len(limit)], tangents)

@@ -18,10 +18,8 @@ NEAR = 1e-9  # times count as equal if they differ by at most this, relative to 
 ROUNDING = 1e-9  # deviation attributed to rounding, relative to the largest acceleration or multiplier
 SINGULAR_START = 1e-5  # largest error of the accelerations at a start in a singular position, relative to the largest
 LIMIT_OF_A = 10.0  # a and lam may be off by what errors of this many tolerances in the stored state can cause
-MIN_EFFECT = 1e-6  # smallest effect of errors of the state on an a or lam, relative to the largest on one of these
-NEAR_SINGULAR = (
-    0.02  # positions are near a singular one if (smallest / largest singular value) of [C_q; A] is below this
-)
+MIN_EFFECT = 1e-6  # errors of the state are assumed to change each a (or lam) by this times their largest effect on one
+NEAR_SINGULAR = 0.02  # a position is near a singular one if (smallest / largest singular value) of [C_q; A] is smaller
 PATTERNS = 3  # number of sign patterns of the perturbations by which the effect of a tolerance is measured
 
 
@@ -151,16 +149,15 @@ def _acceleration_faults(
             with np.errstate(invalid="ignore"):
                 effect = np.fmax(effect, np.abs(evaluate(t + sign * shift, states + sign * signs * change) - exact))
     largest = np.nanmax(np.abs(exact), axis=0, initial=0.0)
-    # in an equilibrium, accelerations are differences of forces, so that the free ones count as their magnitude, too
+    # in equilibrium, accelerations are rounding errors of forces that cancel: so accelerations by the applied forces
+    # without constraints count as their magnitude, too
     inertia = np.diagonal(system.mass(float(t[0]), states[0, :n]))
     forces = np.abs(system.force(float(t[0]), *states[0].reshape(2, n)))
     largest[:n] = np.maximum(largest[:n], np.divide(forces, inertia, out=np.zeros(n), where=inertia > 0.0))
-    groups = np.arange(len(largest)) >= n  # False: a, True: lam
-    magnitudes, strongest = (
-        np.where(groups, each[groups].max(initial=0.0), each[:n].max(initial=0.0))
-        for each in (largest, np.nanmax(effect, axis=0, initial=0.0))
-    )
-    allowed = LIMIT_OF_A * effect + ROUNDING * magnitudes + MIN_EFFECT * strongest
+    always_allowed = ROUNDING * largest + MIN_EFFECT * np.nanmax(effect, axis=0, initial=0.0)
+    for part in (slice(0, n), slice(n, None)):  # a, lam
+        always_allowed[part] = always_allowed[part].max(initial=0.0)
+    allowed = LIMIT_OF_A * effect + always_allowed
     with np.errstate(invalid="ignore"):
         deviation = np.abs(stored - exact)
         is_wrong = np.isfinite(exact) & ~(deviation <= allowed)

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from twoloop.checks.structure import redundant_rows
 from twoloop.kernels.compile.linking import entry_point
 from twoloop.kernels.data import indices
 from twoloop.kernels.data.common import Kit
@@ -93,20 +94,18 @@ def velocity_changes(mass: Array, rows: Array, impulses: Array, rates: Array) ->
 
     If inertia is missing in some direction, X is not unique: return the X of least norm in `equilibrating_units`.
     """
-    kept = independent_rows(rows)
-    matrix = np.block([[mass, rows[kept].T], [rows[kept], np.zeros((len(kept),) * 2)]])
+    independent = independent_rows(rows)
+    G = rows[independent]
+    matrix = np.block([[mass, G.T], [G, np.zeros((len(G),) * 2)]])
     units = equilibrating_units(matrix, len(mass))
-    return solve_scaled(matrix, np.vstack([impulses, rates[kept]]), units)[: len(mass)]
+    return solve_scaled(matrix, np.vstack([impulses, rates[independent]]), units)[: len(mass)]
 
 
 def independent_rows(rows: Array) -> NDArray[np.int64]:
     """Return the indices, in ascending order, of rows that span all `rows`."""
-    from scipy.linalg import qr  # imported here, as few runs need it
-
     norms = np.linalg.norm(rows, axis=1)
-    triangle, order = qr((rows / np.where(norms > 0.0, norms, 1.0)[:, None]).T, mode="r", pivoting=True)
-    pivots = np.abs(np.diagonal(triangle))
-    return np.sort(order[: int((pivots > NEGLIGIBLE_RATIO * pivots.max(initial=0.0)).sum())]).astype(np.int64)
+    redundant = redundant_rows(rows / np.where(norms > 0.0, norms, 1.0)[:, None], NEGLIGIBLE_RATIO)
+    return np.delete(np.arange(len(rows)), redundant)
 
 
 def solve_scaled(matrix: Array, right_side: Array, units: Array, is_singular: bool = False) -> Array:
