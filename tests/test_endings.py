@@ -272,11 +272,19 @@ def test_a_handler_of_the_users_own_stays():
 class Alarm(ValueError): ...  # the errors of callbacks and of runs in sweeps are handled
 
 
+# made beforehand, because checks of arguments convert errors, also those of handlers
+NEW_PROBLEMS = [mechanisms.four_bar() for _ in range(60)]
+
+
+def start(problem):
+    Integrator(problem.system).start(0.0, problem.q0, problem.v0)
+
+
 WORK = {
     "runs": lambda system: solve_dae(system, (0.0, 10.0), *START, "RadauIIA5", 1e-6, 1e-6),
     "samples": lambda system: [(sampled := Integrator(system)).start(0.0, *START), sampled.step(0.1)],
     "compiled": lambda system: run(mechanisms.four_bar(), 20.0),
-    "starts": lambda _: Integrator((new := mechanisms.four_bar()).system).start(0.0, new.q0, new.v0),
+    "starts": lambda system: start(NEW_PROBLEMS.pop() if NEW_PROBLEMS else mechanisms.four_bar()),
     "sweeps": lambda system: sweep(mechanisms.pendulum, [{"start": -1.0}] * 2, t_span=(0.0, 50.0), parallel="threads"),
     "dense": lambda system: solve_dae(system, (0.0, 1.0), *START, dense_output=True).sol(np.linspace(0.0, 1.0, 300)),
 }
@@ -306,6 +314,19 @@ def test_a_handler_that_compilation_delays_is_called_although_others_were_never_
     try:
         SignalHandlers()  # as an exception between two instructions may leave them
         with pytest.raises(ZeroDivisionError), SignalHandlers():
+            exec("signal.raise_signal(signal.SIGINT)", {"__name__": "numba", "signal": signal})
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def test_handlers_that_were_never_restored_delay_no_signals_after_their_function():
+    def leave():
+        SignalHandlers()
+
+    before = signal.signal(signal.SIGINT, lambda number, frame: 1 / 0)
+    try:
+        leave()
+        with pytest.raises(ZeroDivisionError):
             exec("signal.raise_signal(signal.SIGINT)", {"__name__": "numba", "signal": signal})
     finally:
         signal.signal(signal.SIGINT, before)

@@ -270,3 +270,23 @@ def test_a_sample_beside_a_singular_position_is_right_or_the_step_says_so(method
             except RuntimeError:
                 continue
         assert said or errors_of_velocities(np.array([state.t]), state.v[:, None], 1e-8)[0] < 1e3
+
+
+@pytest.mark.filterwarnings("ignore:the constraints of:twoloop.ConstraintWarning")
+@pytest.mark.parametrize(("method", "tolerance"), [("RadauIIA9", 5e-10), ("DOP853", 1e-6), slow("RadauIIA5", 3e-10)])
+def test_states_beside_a_singular_position_are_those_of_the_polynomial_across_it(method, tolerance):
+    """A bar on three parallel cranks only translates: before, steps that approached the ground line gave it a spin."""
+    model = PlanarModel(gravity=(0.0, -9.81))
+    model.rod("bar", (0.6, 0.8), (2.6, 0.8), mass=2.0)
+    for i in range(3):
+        model.rod(f"crank {i}", (i, 0.0), (i + 0.6, 0.8), mass=1.0, angular_velocity=-1.0)
+        model.revolute("ground", f"crank {i}", at=(i, 0.0))
+        model.revolute(f"crank {i}", "bar", at=(i + 0.6, 0.8))
+    problem = model.problem((0.0, 0.5))
+    result, system = run_problem(problem, 0.5, method=method, rtol=tolerance, atol=tolerance), problem.system
+    assert result.success, result.message
+    assert np.abs(result.v[2]).max() < 1e-9 and np.abs(result.a[2]).max() < 1e-6
+    for t, q, v, a, lam in zip(result.t, result.q.T, result.v.T, result.a.T, result.lam.T, strict=True):
+        np.testing.assert_allclose(system.mass(t, q) @ a + system.rows(t, q).T @ lam, system.force(t, q, v), atol=1e-7)
+        np.testing.assert_allclose(system.constraint(t, q), 0.0, atol=1e-13)
+        np.testing.assert_allclose(system.velocity_constraint(t, q, v), 0.0, atol=1e-12)

@@ -26,7 +26,9 @@ from twoloop.solve import solve_dae
 
 MAX_SYSTEMS = 64  # largest number of cached systems with other parameters
 OPTIONS_OF_START = {"method", "rtol", "atol", "max_step", "check_derivatives"}
-ARGUMENTS_OF_RUN = {"system", "t_span", "q0", "v0", "method", "rtol", "atol", "t_eval", "store"}  # no options
+DEFAULTS = {name: parameter.default for name, parameter in inspect.signature(solve_dae).parameters.items()}
+# not options, but arguments of `run` or of the integrator itself
+ARGUMENTS_OF_RUN = {"system", "t_span", "q0", "v0", "method", "rtol", "atol", "t_eval", "store"}
 
 
 class Integrator:
@@ -72,12 +74,11 @@ class Integrator:
         **options: Any,
     ):
         check_system(system)
-        parameters = inspect.signature(solve_dae).parameters
-        names = parameters.keys() - ARGUMENTS_OF_RUN
+        names = DEFAULTS.keys() - ARGUMENTS_OF_RUN
         unknown = [name for name in options if name not in names]
         if unknown:
             raise TypeError(f"Integrator has no option {unknown[0]!r}; its options are {', '.join(sorted(names))}")
-        option_values = {name: options.get(name, parameters[name].default) for name in names - {"events"}}
+        option_values = {name: options.get(name, DEFAULTS[name]) for name in names - {"events"}}
         options_of(system, method, rtol, atol, **option_values)
         check_events(options.get("events"))
         self.system = system

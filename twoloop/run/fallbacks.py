@@ -383,8 +383,6 @@ def handle_crossing(run: Run, plan: Plan, control: Array, code: int, n_accepted:
             run.piece_ends = kernels.piece_ends(plan.memory, plan.options[-kernels.S :], float(clock[a.T]))
             if end > run.t1 - (t_now - clock[a.T]):
                 run.piece_ends = [*[piece for piece in run.piece_ends if piece < run.t1 - t_now + clock[a.T]], run.t1]
-            if clock[a.T] > clock[a.T_START]:
-                run.state[: 3 * run.system.n_q] = kernels.state_at(plan.memory, plan.options, float(clock[a.T]))
         elif n_accepted == 0:
             run.piece_ends.pop(0)
         run.piece_ends = [piece for piece in run.piece_ends if piece > t_now]

@@ -73,8 +73,8 @@ from twoloop.run.record import (
 )
 from twoloop.run.rerun import check_callbacks_along_run, checked_region_of
 from twoloop.run.run import SMALL_SYSTEM, Buffers, Run
-from twoloop.run.signals import SignalHandlers, is_in_user_function, raised_by_handler
-from twoloop.run.singular_positions import TimedState, has_velocity_jump_at_end
+from twoloop.run.signals import CALLERS_OF_USER_CODE, SignalHandlers, is_within, raised_by_handler
+from twoloop.run.singular_positions import TimedState, has_velocity_jump_at_end, state_beside_singularity
 
 Array = NDArray[np.float64]
 
@@ -119,7 +119,7 @@ class Interrupts:
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
         self.n_signals += 1
-        if self.n_signals > MAX_STORED_SIGNALS or is_in_user_function(frame):
+        if self.n_signals > MAX_STORED_SIGNALS or is_within(frame, CALLERS_OF_USER_CODE):
             raise KeyboardInterrupt
 
 
@@ -389,7 +389,7 @@ class IntegrationLoop:
             had_pieces = bool(run.piece_ends)
             self.plan, self.control, self.code = handle_crossing(run, self.plan, self.control, self.code, n_steps)
             if run.piece_ends and not had_pieces:
-                self._correct_last_state()
+                self._correct_last_states()
             if self.plan is run.plan:
                 self.kit = run.kit
 
@@ -404,13 +404,29 @@ class IntegrationLoop:
         ends = [state for before, state in pairwise(states[-N_LAST_STATES:-N_RECENT]) if state[0] - before[0] >= long]
         return ends[-N_RECENT:] + states[-N_RECENT:]
 
-    def _correct_last_state(self) -> None:
-        """Replace the last recorded [q, v, a] by `run.state`, the value of a polynomial across a singular position."""
-        run = self.run
-        t, row = float(run.clock[run.a.T]), run.state[: 3 * run.system.n_q]
-        self.recorder.correct_last_state(t, row)
-        if self.latest_chunks and len(self.latest_chunks[-1][0]) and self.latest_chunks[-1][0][-1] == t:
-            self.latest_chunks[-1][1][-1, : len(row)] = row
+    def _correct_last_states(self) -> None:
+        """Move the last recorded states, which rounding may have spoiled, onto a polynomial across a singular position.
+
+        Only states after the beginning of the polynomial are moved. States in files are not: files are written once.
+        """
+        from twoloop.kernels.steps import crossing_step as kernels
+
+        run, (memory, options) = self.run, (self.plan.memory, self.plan.options)
+        base, now, n = memory[-kernels.N_STORED :][kernels.BASE], float(run.clock[run.a.T]), 3 * run.system.n_q
+        lam, rtol = run.crossings[-1][0][1][n:], run.tolerances[indices.RTOL]
+        if now == run.clock[run.a.T_START]:
+            return
+        run.state[:] = state_beside_singularity(run.system, now, kernels.state_at(memory, options, now), lam, rtol)
+        for times, rows in self.latest_chunks:
+            for t, row in zip(times.tolist(), rows, strict=True):
+                if t == now:
+                    row[:] = run.state
+                elif base < t < now:  # base is NaN if the polynomial begins at the last state
+                    state = kernels.state_at(memory, options, t)
+                    row[:] = state_beside_singularity(run.system, t, state, lam, rtol)
+                else:
+                    continue
+                self.recorder.correct_state(t, row)
 
     def _needs_substitute(self, in_crossing: bool) -> bool:
         """Return whether another method must take over because of STEP_TOO_SMALL far from singular positions."""

@@ -189,10 +189,9 @@ class Recorder:
         if len(self._t) > self._max_pending:
             self.search_intervals(len(self._t) - WINDOW)
 
-    def correct_last_state(self, t: float, row: Array) -> None:
-        """If the last state is at t, replace its [q, v, a] by `row`, so that later interpolations use `row`."""
-        if self.request.between_steps and len(self._t) and self._t[-1] == t:
-            self._rows[-1, : len(row)] = row
+    def correct_state(self, t: float, row: Array) -> None:
+        """Replace the pending state at time t by `row`, so that later interpolations use `row`."""
+        self._rows[self._t == t] = row
 
     def store_crossing(self, memory: Array) -> None:
         """If `memory` has the polynomial of a crossing that began at the last state, copy `memory` for dense output."""

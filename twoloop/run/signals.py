@@ -5,7 +5,8 @@ import _signal  # type: ignore[import-not-found]
 import signal
 import sys
 import threading
-from types import FrameType, TracebackType
+from collections.abc import Container
+from types import CodeType, FrameType, TracebackType
 from typing import Any
 
 from twoloop.problem.callbacks import PythonFunctions
@@ -14,6 +15,7 @@ from twoloop.problem.system import ConstrainedSystem
 
 # code objects of the two functions of twoloop that call the user's callbacks and event functions
 CALLERS_OF_USER_CODE = (PythonFunctions.call.__code__, Event.__call__.__code__)
+INSTALLERS = ("signals_of", "install_handlers")  # functions that create `SignalHandlers` for their callers
 COMPILERS = ("numba", "llvmlite")  # packages in which a handler must not raise: their data would be left incomplete
 # signals whose handlers are replaced; not all of them exist on Windows
 SIGNAL_NAMES = ("SIGALRM", "SIGINT", "SIGTERM", "SIGUSR1", "SIGUSR2", "SIGVTALRM", "SIGPROF", "SIGHUP")
@@ -31,6 +33,10 @@ class SignalHandlers:
     """
 
     def __init__(self, ctrl_c: bool = False) -> None:
+        owner = sys._getframe(1)
+        while owner.f_back is not None and owner.f_code.co_name in INSTALLERS:
+            owner = owner.f_back
+        self._owner = owner.f_code  # code of the function for which the handlers are replaced
         self._user_handlers: dict[int, Any] = {}
         self._delayed_calls: list[int] = []  # numbers of signals whose handlers are still to be called
         self._handler_error: BaseException | None = None
@@ -47,7 +53,10 @@ class SignalHandlers:
             raise
 
     def _receive(self, number: int, frame: FrameType | None) -> None:
-        if is_in_compiler(frame):
+        if not is_within(frame, {self._owner}):  # `restore` was not called, as an exception came just before
+            _signal.signal(number, self._user_handlers[number])
+            self._user_handlers[number](number, frame)
+        elif is_in_compiler(frame):
             self._delayed_calls.append(number)
         else:
             self._call_handler(number, frame)
@@ -88,13 +97,11 @@ def signals_of(system: ConstrainedSystem) -> SignalHandlers:
     return SignalHandlers(ctrl_c=system.called_in_python)
 
 
-def is_in_user_function(frame: FrameType | None) -> bool:
-    """Return True if a stack frame is within a user's callback or event function, called by twoloop."""
-    while frame is not None:
-        if frame.f_code in CALLERS_OF_USER_CODE:
-            return True
+def is_within(frame: FrameType | None, codes: Container[CodeType]) -> bool:
+    """Return True if a stack frame, or one of its callers, executes one of the code objects `codes`."""
+    while frame is not None and frame.f_code not in codes:
         frame = frame.f_back
-    return False
+    return frame is not None
 
 
 def is_in_compiler(frame: FrameType | None) -> bool:
