@@ -15,7 +15,6 @@ from twoloop.problem.system import ConstrainedSystem
 
 # code objects of the two functions of twoloop that call the user's callbacks and event functions
 CALLERS_OF_USER_CODE = (PythonFunctions.call.__code__, Event.__call__.__code__)
-INSTALLERS = ("signals_of", "install_handlers")  # functions that create `SignalHandlers` for their callers
 COMPILERS = ("numba", "llvmlite")  # packages in which a handler must not raise: their data would be left incomplete
 # signals whose handlers are replaced; not all of them exist on Windows
 SIGNAL_NAMES = ("SIGALRM", "SIGINT", "SIGTERM", "SIGUSR1", "SIGUSR2", "SIGVTALRM", "SIGPROF", "SIGHUP")
@@ -34,9 +33,9 @@ class SignalHandlers:
 
     def __init__(self, ctrl_c: bool = False) -> None:
         owner = sys._getframe(1)
-        while owner.f_back is not None and owner.f_code.co_name in INSTALLERS:
+        while owner.f_back is not None and _package_of(owner.f_back) == "twoloop":
             owner = owner.f_back
-        self._owner = owner.f_code  # code of the function for which the handlers are replaced
+        self._owner = owner.f_code  # code of the function of twoloop that the user has called
         self._user_handlers: dict[int, Any] = {}
         self._delayed_calls: list[int] = []  # numbers of signals whose handlers are still to be called
         self._handler_error: BaseException | None = None
@@ -97,6 +96,10 @@ def signals_of(system: ConstrainedSystem) -> SignalHandlers:
     return SignalHandlers(ctrl_c=system.called_in_python)
 
 
+def _package_of(frame: FrameType) -> str:
+    return str(frame.f_globals.get("__name__", "")).partition(".")[0]
+
+
 def is_within(frame: FrameType | None, codes: Container[CodeType]) -> bool:
     """Return True if a stack frame, or one of its callers, executes one of the code objects `codes`."""
     while frame is not None and frame.f_code not in codes:
@@ -107,7 +110,7 @@ def is_within(frame: FrameType | None, codes: Container[CodeType]) -> bool:
 def is_in_compiler(frame: FrameType | None) -> bool:
     """Return True if a stack frame is within numba or llvmlite, and not in a user's function that these call."""
     while frame is not None and frame.f_code not in CALLERS_OF_USER_CODE:
-        if frame.f_globals.get("__name__", "").partition(".")[0] in COMPILERS:
+        if _package_of(frame) in COMPILERS:
             return True
         frame = frame.f_back
     return False
