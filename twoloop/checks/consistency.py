@@ -74,6 +74,10 @@ def _unconstrained_accelerations(system: ConstrainedSystem, t: float, q: Array, 
     return accelerations
 
 
+class Inconsistent(ValueError):
+    """Error: a state violates the constraints."""
+
+
 class Violation:
     """Violation of constraints by a state, measured by the change of coordinates (or velocities) that corrects it.
 
@@ -158,11 +162,11 @@ class Violation:
             return max(float((part[part > 0.0] / allowed[part > 0.0]).max(initial=0.0)) for part, allowed in parts)
 
     def refuse(self, name: str) -> None:
-        """Raise unless the state is consistent."""
+        """Raise `Inconsistent` unless the state is consistent."""
         if self.excess <= 1.0:
             return
         row = int(np.abs(self.values).argmax())
-        raise ValueError(
+        raise Inconsistent(
             f"{name} is not consistent with the constraints of {self.system.name!r}: max|{self.equation}| is "
             f"{abs(self.values[row]):.3g} (row {row}) at t = {self.t:g}; {self._remedy(name)}"
         )

@@ -22,6 +22,7 @@ from twoloop.checks.arguments import (
     check_vector,
     shown,
 )
+from twoloop.checks.consistency import Inconsistent
 from twoloop.impacts.contact import Accelerations, ContactSystem, Gap, Gaps
 from twoloop.impacts.friction import (
     IDLE,
@@ -145,10 +146,11 @@ class Motion:
             t_before = self.t
             try:
                 self._run_arc(self._resolve_contacts(), t1)
-            except Undetermined as error:
+            except (Undetermined, Inconsistent) as error:
                 if not self.arcs:
                     raise
-                return self._result(times, f"Stopped at t = {self.t:.10g}: {error}.")
+                reason = "no motion can begin there: " * isinstance(error, Inconsistent) + str(error)
+                return self._result(times, f"Stopped at t = {self.t:.10g}: {reason}.")
             arc = self.arcs[-1]
             if arc.status != Status.EVENT or self.t >= t1:
                 return self._result(times)
@@ -439,7 +441,7 @@ class Motion:
         # a system with sticking parts cannot be cached: its rows depend on where these stick
         cacheable = not {STICKS, IDLE} & set(signs) and not mode.sticking_groups
         system = self._contact_system(free_system, mode, cacheable)
-        if system.n_c and (resting or self.modes.n_joints):
+        if system.n_c and (resting or self.modes.n_joints or self.arcs):
             self._project(system, resting)
         if self.arcs or resting:
             self.q[np.abs(self.q) < NEGLIGIBLE_VALUE] = 0.0
