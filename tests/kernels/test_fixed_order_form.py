@@ -219,3 +219,23 @@ def test_an_entry_that_comes_up_on_the_way_ends_the_fixed_order_form(both):
     start = (0.0, 1.2), np.zeros(2 * n), np.eye(2 * n)[1]
     one, other = both(lambda: solve_dae(system, *start, "DOP853", time_limit=20.0))
     assert one.success and other.success and abs(one.q[0, -1]) > 0.05 and worst(one.q[:, -1], other.q[:, -1]) < 1e-9
+
+
+@pytest.mark.filterwarnings("ignore:the constraints of:twoloop.ConstraintWarning")
+def test_a_large_model_with_more_rows_than_coordinates():
+    """A bar on 44 parallel cranks in space: each hinge takes five freedoms, and only one freedom is left."""
+    n, angle = 44, 0.9
+    model, tip = SpatialModel(gravity=(0.0, 0.0, -9.81)), np.array([np.cos(angle), 0.0, np.sin(angle)])
+    model.rod("bar", tip, tip + np.array([n, 0.0, 0.0]), mass=2.0, radius=0.01)
+    for i in range(n):
+        foot = np.array([i, 0.0, 0.0])
+        model.rod(f"crank {i}", foot, foot + tip, mass=1.5, radius=0.01)
+        model.revolute("ground", f"crank {i}", at=foot, axis=(0.0, 1.0, 0.0))
+        model.revolute(f"crank {i}", "bar", at=foot + tip, axis=(0.0, 1.0, 0.0))
+    problem = model.problem((0.0, 0.01))
+    assert problem.system.n_c > problem.system.n_q
+    result = solve_dae(problem.system, problem.t_span, problem.q0, problem.v0, "DOP853")
+    assert result.success, result.message
+    inertia = n * 1.5 * (1.0 / 3.0 + 0.01**2 / 4.0) + 2.0
+    turn = -(n * 1.5 * 0.5 + 2.0) * 9.81 * np.cos(angle) / inertia  # angular acceleration at the start
+    np.testing.assert_allclose(np.linalg.norm(result.a[:3, 0]), abs(turn), rtol=1e-9)

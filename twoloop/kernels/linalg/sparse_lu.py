@@ -11,6 +11,7 @@ the same row. So one displacement, of all coordinates of a group, yields all its
 Powell & Reid 1974, doi 10.1093/imamat/13.1.117).
 """
 
+from collections import defaultdict
 from collections.abc import Iterable, Sequence
 
 import numpy as np
@@ -71,7 +72,7 @@ def column_groups(entries: Entries, n_q: int) -> Integers:
     for i, j in zip(*(indices.tolist() for indices in entries), strict=True):
         rows_of[j].append(i)
     groups = np.zeros(n_q, dtype=np.int64)
-    groups_by_row: list[set[int]] = [set() for _ in range(n_q)]  # for each row: groups of columns with entries in it
+    groups_by_row: defaultdict[int, set[int]] = defaultdict(set)  # for each row: groups of columns with entries in it
     for j, rows in enumerate(rows_of):
         groups_in_rows = set().union(*(groups_by_row[i] for i in rows))
         groups[j] = group = next(k for k in range(n_q) if k not in groups_in_rows)
