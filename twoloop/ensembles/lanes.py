@@ -238,13 +238,19 @@ class LaneRuns:
         choice = PivotChoice.choose(system_of(system, starts, 0), starts.t0, starts.q[0])
         kind = ("lanes", method.series, method.tableau is None, choice, tuple(varying))  # key of the cached code
 
-        def generate() -> GeneratedLanes[LaneCode]:
+        def generate() -> GeneratedLanes[LaneCode] | Untraceable:
             from twoloop.generate.lane_code import GeneratedLanes, LaneCode  # loads kernels: at the first ensemble
 
             tape = ParameterTape(generic.tolist(), varying)
-            return GeneratedLanes(tape, LaneCode(system, choice, tape.parameters, method.series, method.tableau))
+            try:
+                return GeneratedLanes(tape, LaneCode(system, choice, tape.parameters, method.series, method.tableau))
+            except Untraceable as reason:  # cached, because long equations take seconds to trace
+                return reason
 
-        self.generated = system.remembered_at(kind, generic.tobytes(), generate)
+        generated = system.remembered_at(kind, generic.tobytes(), generate)
+        if isinstance(generated, Untraceable):
+            raise generated
+        self.generated = generated
 
     def integrate(
         self,

@@ -261,8 +261,8 @@ def _scale_factors(singular: Sequence[int], mass: Array, G: Array) -> Array:
     has nonzero entries, and rows `singular` have nonzero entries in all these columns, too. Otherwise, the factor is 1.
     """
     rows, covered = np.abs(G), np.any(G[list(singular)], axis=0)
-    has_entry = rows > 0.0
-    own = np.where(has_entry[:, :, None] & has_entry[:, None, :], np.abs(mass), 0.0).max(axis=(1, 2), initial=0.0)
+    columns = [np.flatnonzero(row) for row in rows]
+    own = np.array([np.abs(mass[np.ix_(each, each)]).max(initial=0.0) for each in columns])
     own /= np.maximum(rows.max(axis=1, initial=0.0), np.finfo(float).tiny) ** 2
     ratio = own / (np.abs(mass).max() / rows.max() ** 2)
     smaller = (ratio > 0.0) & ~rows[:, ~covered].any(axis=1)
@@ -315,7 +315,7 @@ class Elimination:
         rates = [self._callback_terms("constraint_rate"), self._callback_terms("nonholonomic_rate")]
         self.all_rows, independent = np.vstack(rows), list(choice.rows)
         self.rows, self.rates = self.all_rows[independent], np.concatenate(rates)[independent]
-        self.factors = Factors(self._matrix(), n + len(self.rows), n)
+        self.factors = Factors(self._matrix(), n + len(self.rows), n, self._check_length)
         self.conditions = [(pivot, alone.times(choice.min_pivot)) for pivot, alone in self.factors.conditions]
         self.conditions += [(pivot, self.zero) for pivot in self.factors.mass_pivots if pivot.terms]
         self.redundant_rows = self._redundant_rows(np.concatenate(rates))

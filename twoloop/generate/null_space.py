@@ -37,6 +37,8 @@ class Block(NamedTuple):
 class Factors:
     """Factors L D L^T of a symmetric matrix [M G^T; G 0] of expressions; M has `n` rows.
 
+    `check_length` is called after each block; it raises Untraceable if the expressions have become too many.
+
     blocks : blocks in the order of elimination.
     conditions : for each row of G, a pair of positive expressions: the magnitude of its pivot, and the magnitude that
         this pivot would have if G had no other rows. If the first is less than a small fraction of the second, the row
@@ -44,7 +46,9 @@ class Factors:
     mass_pivots : all other pivots. If M is positive definite, each of them is positive or a constant number.
     """
 
-    def __init__(self, matrix: dict[tuple[int, int], Affine], size: int, n: int):
+    def __init__(
+        self, matrix: dict[tuple[int, int], Affine], size: int, n: int, check_length: Callable[[], None] = lambda: None
+    ):
         rows: list[dict[int, Affine]] = [{} for _ in range(size)]
         for (i, j), value in matrix.items():
             rows[i][j] = value
@@ -69,6 +73,7 @@ class Factors:
                 for i in row_indices:
                     rows[j].pop(i, None)
             self.blocks.append(Block(row_indices, inverse, rows_below))
+            check_length()
 
     def _inverse(self, pivots: list[list[Affine]], own_pivots: list[Any]) -> list[list[Affine]]:
         """Return the inverse of a 1x1 or 2x2 pivot block, and append its pivots to `mass_pivots` or `conditions`.

@@ -13,6 +13,7 @@ from twoloop.run.record import Record, Status
 from twoloop.run.singular_start import Branch, branch_at
 
 Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
 
 NEAR = 1e-9  # times count as equal if they differ by at most this, relative to the duration of the run
 ROUNDING = 1e-9  # deviation attributed to rounding, relative to the largest acceleration or multiplier
@@ -140,27 +141,34 @@ def _acceleration_faults(
         return out
 
     exact = evaluate(t, states)
-    change = np.tile(atol, 2) + rtol * np.abs(states)
-    effect = rtol * np.abs(exact)
-    shift = NEAR * float(t[-1] - t[0])
-    for k in range(PATTERNS):
-        signs = np.where((np.arange(2 * n) * (2 * k + 1)) % (k + 3) < (k + 3) / 2, 1.0, -1.0)
-        for sign in (1.0, -1.0):
-            with np.errstate(invalid="ignore"):
-                effect = np.fmax(effect, np.abs(evaluate(t + sign * shift, states + sign * signs * change) - exact))
     largest = np.nanmax(np.abs(exact), axis=0, initial=0.0)
     # in equilibrium, accelerations are rounding errors of forces that cancel: so accelerations by the applied forces
     # without constraints count as their magnitude, too
     inertia = np.diagonal(system.mass(float(t[0]), states[0, :n]))
     forces = np.abs(system.force(float(t[0]), *states[0].reshape(2, n)))
     largest[:n] = np.maximum(largest[:n], np.divide(forces, inertia, out=np.zeros(n), where=inertia > 0.0))
-    always_allowed = ROUNDING * largest + MIN_EFFECT * np.nanmax(effect, axis=0, initial=0.0)
-    for part in (slice(0, n), slice(n, None)):  # a, lam
-        always_allowed[part] = always_allowed[part].max(initial=0.0)
-    allowed = LIMIT_OF_A * effect + always_allowed
     with np.errstate(invalid="ignore"):
         deviation = np.abs(stored - exact)
-        is_wrong = np.isfinite(exact) & ~(deviation <= allowed)
+
+    def find_wrong(effect: Array) -> tuple[Flags, Array]:
+        always_allowed = ROUNDING * largest + MIN_EFFECT * np.nanmax(effect, axis=0, initial=0.0)
+        for part in (slice(0, n), slice(n, None)):  # a, lam
+            always_allowed[part] = always_allowed[part].max(initial=0.0)
+        allowed = LIMIT_OF_A * effect + always_allowed
+        with np.errstate(invalid="ignore"):
+            return np.isfinite(exact) & ~(deviation <= allowed), allowed
+
+    effect = rtol * np.abs(exact)
+    if not find_wrong(effect)[0].any():
+        return  # states need not be perturbed, which takes long in large systems
+    change = np.tile(atol, 2) + rtol * np.abs(states)
+    shift = NEAR * float(t[-1] - t[0])
+    for k in range(PATTERNS):
+        signs = np.where((np.arange(2 * n) * (2 * k + 1)) % (k + 3) < (k + 3) / 2, 1.0, -1.0)
+        for sign in (1.0, -1.0):
+            with np.errstate(invalid="ignore"):
+                effect = np.fmax(effect, np.abs(evaluate(t + sign * shift, states + sign * signs * change) - exact))
+    is_wrong, allowed = find_wrong(effect)
     for i in np.flatnonzero(is_wrong.any(axis=1)):
         singular_values = np.linalg.svd(system.rows(float(t[i]), states[i, :n]), compute_uv=False)
         if ranks[1] > 0 and singular_values[ranks[1] - 1] < NEAR_SINGULAR * singular_values[0]:
