@@ -30,7 +30,8 @@ DISPLACEMENT = 1e-6
 # each row of the Jacobian is divided by its norm. But if a row is small only at this position, it is divided by
 # MIN_ROW_NORM times the norm that the row has nearby (estimated from the row's derivative)
 MIN_ROW_NORM = 0.1
-ERROR_OF_A = 100.0  # assumed error of accelerations beside a singular position, in rtol
+# Newton's method for q ends after a relative change of at most MAX_SQUARED, whose square is a rounding error
+MAX_SQUARED, MAX_ITERATIONS = 1e-8, 10
 # velocities jumped in a step if their change exceeds both JUMP_RATIO * step size * acceleration and MIN_JUMP tolerances
 JUMP_RATIO, MIN_JUMP = 3.0, 10.0
 
@@ -216,17 +217,21 @@ def state_beside_singularity(system: ConstrainedSystem, t: float, state: Array, 
     """Complete [q, v, a] beside a singular position to [q, v, a, lam], with q and v on the constraints.
 
     Rounding errors are large along the singular vectors of the Jacobian with the least singular values. There, q and v
-    remain as they are, and multipliers equal those of an earlier state, `lam`, if they cannot be computed to `rtol`.
+    remain as they are, and multipliers equal those of an earlier state, `lam`, if errors of `a`, about `rtol` relative
+    to the largest, would make other multipliers wrong.
     """
     q, v, a = state.copy().reshape(3, system.n_q)
-    for _ in range(2):  # Newton steps
+    for _ in range(MAX_ITERATIONS):  # Newton's method
         constraints = np.append(system.constraint(t, q), np.zeros(system.n_a))
-        q -= np.linalg.lstsq(system.rows(t, q), constraints, rcond=LOST_RANK_RATIO)[0]
+        correction = np.linalg.lstsq(system.rows(t, q), constraints, rcond=LOST_RANK_RATIO)[0]
+        q -= correction
+        if not np.abs(correction).max() > MAX_SQUARED * np.abs(q).max():
+            break
     rows = system.rows(t, q)
     v -= np.linalg.lstsq(rows, system.velocity_constraint(t, q, v), rcond=LOST_RANK_RATIO)[0]
     missing_force = system.force(t, q, v) - system.mass(t, q) @ a - rows.T @ lam
-    weak_ratio = min(LOST_RANK_RATIO, ERROR_OF_A * rtol)
-    return np.concatenate([q, v, a, lam + np.linalg.lstsq(rows.T, missing_force, rcond=weak_ratio)[0]])
+    missing_lam = np.linalg.lstsq(rows.T, missing_force, rcond=min(LOST_RANK_RATIO, rtol))[0]
+    return np.concatenate([q, v, a, lam + missing_lam])
 
 
 def velocity_rounding_errors(system: ConstrainedSystem, t: float, q: Array, v: Array, rank: int) -> Array:

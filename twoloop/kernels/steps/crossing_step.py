@@ -277,7 +277,7 @@ def state_at(memory, options, t):
     a, stage = memory[: S * n].reshape((S, n)), memory[S * n : (S + 5) * n].reshape((5, n))
     fraction, duration, (q_0, v_0) = (t - stored[BEGIN]) / stored[DURATION], stored[DURATION], stage[3:]
     # row k: values of the Lagrange polynomials at Gauss node k of the time from stored[BEGIN] to t; last row: at t
-    weights = np.array([lagrange_values(c, x) for x in (*(fraction * c), fraction)])
+    weights = lagrange_values(c, fraction * np.append(c, 1.0))
     weights_v = fraction * b @ weights[:-1]
     weights_q = fraction**2 * (b * (1.0 - c)) @ weights[:-1]
     q, v = q_0 + duration * (fraction * v_0 + duration * (weights_q @ a)), v_0 + duration * (weights_v @ a)

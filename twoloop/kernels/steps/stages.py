@@ -49,11 +49,11 @@ def options_array(
     return np.concatenate([scalars, A.ravel(), (A @ A).ravel(), *vectors])
 
 
-def lagrange_values(nodes: NDArray[np.float64], x: float) -> NDArray[np.float64]:
-    """Return the values (s) at x of the Lagrange polynomials of distinct `nodes` (s)."""
-    factors = (x - nodes[None, :]) / (nodes[:, None] - nodes[None, :] + np.eye(len(nodes)))
-    np.fill_diagonal(factors, 1.0)
-    return np.asarray(factors.prod(axis=1))
+def lagrange_values(nodes: NDArray[np.float64], x: ArrayLike) -> NDArray[np.float64]:
+    """Return the values (..., s) at x (...) of the Lagrange polynomials of distinct `nodes` (s)."""
+    same = np.eye(len(nodes))
+    factors = (np.asarray(x)[..., None, None] - nodes) / (nodes[:, None] - nodes + same)
+    return np.asarray(np.where(same, 1.0, factors).prod(axis=-1))
 
 
 @inlined
