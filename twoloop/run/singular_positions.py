@@ -30,6 +30,8 @@ DISPLACEMENT = 1e-6
 # each row of the Jacobian is divided by its norm. But if a row is small only at this position, it is divided by
 # MIN_ROW_NORM times the norm that the row has nearby (estimated from the row's derivative)
 MIN_ROW_NORM = 0.1
+# assumed error of M a beside a singular position, in rtol; singular values below NO_ROW times the largest are rounding
+ERROR_OF_A, NO_ROW = 10.0, 1e-10
 # Newton's method for q ends after a relative change of at most MAX_SQUARED, whose square is a rounding error
 MAX_SQUARED, MAX_ITERATIONS = 1e-8, 10
 # velocities jumped in a step if their change exceeds both JUMP_RATIO * step size * acceleration and MIN_JUMP tolerances
@@ -217,8 +219,8 @@ def state_beside_singularity(system: ConstrainedSystem, t: float, state: Array, 
     """Complete [q, v, a] beside a singular position to [q, v, a, lam], with q and v on the constraints.
 
     Rounding errors are large along the singular vectors of the Jacobian with the least singular values. There, q and v
-    remain as they are, and multipliers equal those of an earlier state, `lam`, if errors of `a`, about `rtol` relative
-    to the largest, would make other multipliers wrong.
+    remain as they are, and multipliers equal those of an earlier state, `lam`, unless forces on the constraints along
+    these vectors exceed the errors of `a`.
     """
     q, v, a = state.copy().reshape(3, system.n_q)
     for _ in range(MAX_ITERATIONS):  # Newton's method
@@ -229,9 +231,13 @@ def state_beside_singularity(system: ConstrainedSystem, t: float, state: Array, 
             break
     rows = system.rows(t, q)
     v -= np.linalg.lstsq(rows, system.velocity_constraint(t, q, v), rcond=LOST_RANK_RATIO)[0]
-    missing_force = system.force(t, q, v) - system.mass(t, q) @ a - rows.T @ lam
-    missing_lam = np.linalg.lstsq(rows.T, missing_force, rcond=min(LOST_RANK_RATIO, rtol))[0]
-    return np.concatenate([q, v, a, lam + missing_lam])
+    lam = np.nan_to_num(lam)  # NaN: unknown at a start in a singular position
+    force, inertia_force = system.force(t, q, v), system.mass(t, q) @ a
+    left, values, right = np.linalg.svd(rows, full_matrices=False)
+    components = right @ (force - inertia_force - rows.T @ lam)
+    noise = ERROR_OF_A * rtol * max(np.abs(force).max(), np.abs(inertia_force).max())
+    is_known = (values > NO_ROW * values[0]) & ((np.abs(components) > noise) | (values > LOST_RANK_RATIO * values[0]))
+    return np.concatenate([q, v, a, lam + left[:, is_known] @ (components[is_known] / values[is_known])])
 
 
 def velocity_rounding_errors(system: ConstrainedSystem, t: float, q: Array, v: Array, rank: int) -> Array:
