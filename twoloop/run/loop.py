@@ -152,6 +152,7 @@ STATUSES_WITH_STIFFNESS_NOTE = {Status.REACHED_END, Status.EVENT, Status.MAX_STE
 # among the last N_LAST_STATES states, the polynomial across a singular position may begin at the last N_RECENT states
 # and, before these, at the last N_RECENT ends of long steps (COLLAPSED_STEP times the longest recent step, or longer)
 N_RECENT, N_LAST_STATES = 16, 256
+MAX_COORDINATES = 100  # with more coordinates, recorded states are not moved onto the polynomial, to save time
 CROSSING_OVERSHOOT = 100.0  # a crossing step may end beyond t1 by at most this multiple of the run's duration
 NO_KINDS = np.zeros(0, dtype=np.int64)  # kinds of intervals if no states between steps are requested
 # MAX_SPARE: largest number of sets of buffers (times, states, steps of a chunk) kept for later runs. MAX_SPARE_FLOATS:
@@ -407,26 +408,36 @@ class IntegrationLoop:
     def _correct_last_states(self) -> None:
         """Move the last recorded states, which rounding may have spoiled, onto a polynomial across a singular position.
 
-        Only states after the beginning of the polynomial are moved. States in files are not: files are written once.
+        Only states after the beginning of the polynomial are moved. States in files are not: files are written once. In
+        large systems, only [q, v, a] of the last state is moved.
         """
         from twoloop.kernels.steps import crossing_step as kernels
 
         run, (memory, options) = self.run, (self.plan.memory, self.plan.options)
-        base, now, n = memory[-kernels.N_STORED :][kernels.BASE], float(run.clock[run.a.T]), 3 * run.system.n_q
-        lam, rtol = run.crossings[-1][0][1][n:], run.tolerances[indices.RTOL]
+        base, now, n = memory[-kernels.N_STORED :][kernels.BASE], float(run.clock[run.a.T]), run.system.n_q
         if now == run.clock[run.a.T_START]:
             return
-        run.state[:] = state_beside_singularity(run.system, now, kernels.state_at(memory, options, now), lam, rtol)
+        lam, rtol = run.crossings[-1][0][1][3 * n :], run.tolerances[indices.RTOL]
+        run.state[: 3 * n] = kernels.state_at(memory, options, now)
         for times, rows in self.latest_chunks:
             for t, row in zip(times.tolist(), rows, strict=True):
-                if t == now:
-                    row[:] = run.state
-                elif base < t < now:  # base is NaN if the polynomial begins at the last state
-                    state = kernels.state_at(memory, options, t)
-                    row[:] = state_beside_singularity(run.system, t, state, lam, rtol)
-                else:
+                # base is NaN if the polynomial begins at the last state
+                if not (base < t < now or t == now) or (t < now and n > MAX_COORDINATES):
                     continue
+                if t == now:
+                    row[: 3 * n] = run.state[: 3 * n]
+                if n <= MAX_COORDINATES:
+                    state = kernels.state_at(memory, options, t)
+                    try:
+                        row[:] = state_beside_singularity(run.system, t, state, row, lam, run.rank, rtol)
+                    except (ArithmeticError, ValueError):  # a callback fails there
+                        continue
+                    except KeyboardInterrupt:
+                        self.code = INTERRUPTED
+                        return
                 self.recorder.correct_state(t, row)
+                if t == now:
+                    run.state[:] = row
 
     def _needs_substitute(self, in_crossing: bool) -> bool:
         """Return whether another method must take over because of STEP_TOO_SMALL far from singular positions."""

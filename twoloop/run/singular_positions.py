@@ -30,8 +30,10 @@ DISPLACEMENT = 1e-6
 # each row of the Jacobian is divided by its norm. But if a row is small only at this position, it is divided by
 # MIN_ROW_NORM times the norm that the row has nearby (estimated from the row's derivative)
 MIN_ROW_NORM = 0.1
-# assumed error of M a beside a singular position, in rtol; singular values below NO_ROW times the largest are rounding
-ERROR_OF_A, NO_ROW = 10.0, 1e-10
+# ERROR_OF_A: assumed error of q, v, a and M a beside a singular position, in rtol. Singular values below NO_ROW times
+# the largest are rounding errors. MAX_ROUNDING is 10 eps: if (least / largest singular value) is s, rounding errors are
+# about eps / s in q, eps / s^2 in v and eps / s^3 in a, relative to the largest
+ERROR_OF_A, NO_ROW, MAX_ROUNDING = 10.0, 1e-10, 10.0 * float(np.finfo(np.float64).eps)
 # Newton's method for q ends after a relative change of at most MAX_SQUARED, whose square is a rounding error
 MAX_SQUARED, MAX_ITERATIONS = 1e-8, 10
 # velocities jumped in a step if their change exceeds both JUMP_RATIO * step size * acceleration and MIN_JUMP tolerances
@@ -175,7 +177,7 @@ def scaled_to_unit_masses(system: ConstrainedSystem, t: float, q: Array) -> tupl
     """
     mass, rows = system.mass(t, q), system.rows(t, q)
     inertia = np.abs(np.diagonal(mass))
-    units = 1.0 / np.sqrt(np.where(inertia > 0.0, inertia, inertia.max()))
+    units = 1.0 / np.sqrt(np.where(inertia > ROUNDING * inertia.max(), inertia, inertia.max()))
     norms = np.linalg.norm(rows * units, axis=1)
     displacement = DISPLACEMENT * max(np.abs(q).max(), DISPLACEMENT) * units / units.max() * signs(len(q))
     try:
@@ -215,29 +217,38 @@ def singular_threshold(rtol: float) -> float:
     )
 
 
-def state_beside_singularity(system: ConstrainedSystem, t: float, state: Array, lam: Array, rtol: float) -> Array:
-    """Complete [q, v, a] beside a singular position to [q, v, a, lam], with q and v on the constraints.
+def state_beside_singularity(
+    system: ConstrainedSystem, t: float, state: Array, recorded: Array, lam: Array, rank: int, rtol: float
+) -> Array:
+    """Complete [q, v, a], from a polynomial across a singular position, to a row [q, v, a, lam] on the constraints.
 
-    Rounding errors are large along the singular vectors of the Jacobian with the least singular values. There, q and v
-    remain as they are, and multipliers equal those of an earlier state, `lam`, unless forces on the constraints along
-    these vectors exceed the errors of `a`.
+    Return the row `recorded` of a step if rounding does not explain its difference: then the forces may have changed in
+    a time that the polynomial passes over. Rounding errors are large along the singular vectors of the Jacobian with
+    the least singular values. There, q and v remain as they are, and multipliers equal those of an earlier state,
+    `lam`, unless forces on the constraints along these vectors exceed the errors of `a`.
     """
     q, v, a = state.copy().reshape(3, system.n_q)
     for _ in range(MAX_ITERATIONS):  # Newton's method
-        constraints = np.append(system.constraint(t, q), np.zeros(system.n_a))
-        correction = np.linalg.lstsq(system.rows(t, q), constraints, rcond=LOST_RANK_RATIO)[0]
+        mass, rows, norms, units = scaled_to_unit_masses(system, t, q)
+        constraints = np.append(system.constraint(t, q), np.zeros(system.n_a)) / norms
+        correction = units * np.linalg.lstsq(rows, constraints, rcond=LOST_RANK_RATIO)[0]
         q -= correction
         if not np.abs(correction).max() > MAX_SQUARED * np.abs(q).max():
             break
-    rows = system.rows(t, q)
-    v -= np.linalg.lstsq(rows, system.velocity_constraint(t, q, v), rcond=LOST_RANK_RATIO)[0]
-    lam = np.nan_to_num(lam)  # NaN: unknown at a start in a singular position
-    force, inertia_force = system.force(t, q, v), system.mass(t, q) @ a
-    left, values, right = np.linalg.svd(rows, full_matrices=False)
-    components = right @ (force - inertia_force - rows.T @ lam)
+    left, values, right = np.linalg.svd(system.rows(t, q) * units / norms[:, None], full_matrices=False)
+    is_large = values > LOST_RANK_RATIO * values[0]
+    violation = left.T @ (system.velocity_constraint(t, q, v) / norms)
+    v -= units * (violation[is_large] / values[is_large] @ right[is_large])
+    lam = norms * np.nan_to_num(lam)  # NaN: unknown at a start in a singular position
+    force, inertia_force = units * system.force(t, q, v), mass @ (a / units)
+    components = right @ (force - inertia_force) - values * (left.T @ lam)
     noise = ERROR_OF_A * rtol * max(np.abs(force).max(), np.abs(inertia_force).max())
-    is_known = (values > NO_ROW * values[0]) & ((np.abs(components) > noise) | (values > LOST_RANK_RATIO * values[0]))
-    return np.concatenate([q, v, a, lam + left[:, is_known] @ (components[is_known] / values[is_known])])
+    is_known = is_large | ((values > NO_ROW * values[0]) & (np.abs(components) > noise))
+    lam = (lam + left[:, is_known] @ (components[is_known] / values[is_known])) / norms
+    row, ratio = np.concatenate([q, v, a, lam]), max(values[rank - 1] / values[0], NO_ROW)
+    changes, sizes = (np.abs(x[: state.size]).reshape(3, -1) / units for x in (row - recorded, recorded))
+    allowed = (ERROR_OF_A * rtol + MAX_ROUNDING / ratio ** np.arange(1, 4)) * sizes.max(axis=1)
+    return row if (changes.max(axis=1) <= allowed).all() else recorded
 
 
 def velocity_rounding_errors(system: ConstrainedSystem, t: float, q: Array, v: Array, rank: int) -> Array:
