@@ -521,17 +521,18 @@ def test_stops_that_depend_on_one_another_keep_their_conditions(joints):
 
 
 @pytest.mark.filterwarnings("ignore::twoloop.ConstraintWarning")
-def test_rebounds_beside_a_singular_position_end_the_run_by_name_if_at_all():
-    """Legs of a parallelogram 1e-6 rad above the ground line: rounding of an impact counted as a wrong start there."""
+@pytest.mark.parametrize("above", [1e-6, 0.0])
+def test_rebounds_beside_a_singular_position_end_the_run_by_name_if_at_all(above):
+    """A parallelogram falls onto its ground line, or nearly: in the middle of a run, an error named a wrong start."""
     model, cosine, height = PlanarModel(gravity=(0.0, -9.81)), np.cos(0.9), np.sin(0.9)
     model.rod("bar", (cosine, height), (1.0 + cosine, height), mass=2.0)
     for i in range(2):
         model.rod(f"leg {i}", (i, 0.0), (i + cosine, height), mass=1.0)
         model.revolute("ground", f"leg {i}", at=(i, 0.0))
         model.revolute(f"leg {i}", "bar", at=(i + cosine, height))
-    model.stop("bar", (cosine, height), "ground", (0.0, 1e-6), normal=(0.0, 1.0), restitution=0.5)
+    model.stop("bar", (cosine, height), "ground", (0.0, above), normal=(0.0, 1.0), restitution=0.5)
     problem = model.problem((0.0, 1.5))
     result = solve_with_stops(problem.system, problem.t_span, problem.q0, problem.v0, problem.stops, law="moreau")
-    assert len(result.impacts) > 1
-    assert abs(result.q[5, -1] - 1e-6) < 1e-5
+    assert result.t[-1] > 0.47
+    assert abs(result.q[5, -1] - above) < 1e-5
     assert result.success or "rank" in result.message or "no motion can begin there" in result.message

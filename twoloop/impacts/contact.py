@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from twoloop.checks.arguments import Array, shown
+from twoloop.checks.consistency import CannotBegin
 from twoloop.generate.derived_callbacks import derive_callbacks
 from twoloop.generate.graph import Affine, Derivative, Graph, Untraceable, symbol_array
 from twoloop.generate.program import MAX_TRACE_DIFFERENCE, N_COMPARED, TIME_SPACING, OperationTable
@@ -223,7 +224,7 @@ class Accelerations:
         plan = DOP853().plan(system.n_q, 1e-8, 1e-8, False)
         self._run = Run(derived, plan, t, q, v, 1e-8, atol, None)
         if isinstance(branch_at(derived, t, self._run.state, self._run.rank, atol), Branch):  # the rank rises beside
-            raise ValueError(
+            raise CannotBegin(
                 f"contact or friction of {system.name!r} must not begin in a singular position, as at t = {t:g}: the "
                 "constraints have lost rank there, but not beside it. Start a little before that position, or beyond"
             )

@@ -22,7 +22,7 @@ from twoloop.checks.arguments import (
     check_vector,
     shown,
 )
-from twoloop.checks.consistency import Inconsistent
+from twoloop.checks.consistency import CannotBegin
 from twoloop.impacts.contact import Accelerations, ContactSystem, Gap, Gaps
 from twoloop.impacts.friction import (
     IDLE,
@@ -146,10 +146,10 @@ class Motion:
             t_before = self.t
             try:
                 self._run_arc(self._resolve_contacts(), t1)
-            except (Undetermined, Inconsistent) as error:
+            except (Undetermined, CannotBegin) as error:
                 if not self.arcs:
                     raise
-                reason = "no motion can begin there: " * isinstance(error, Inconsistent) + str(error)
+                reason = "no motion can begin there: " * isinstance(error, CannotBegin) + str(error)
                 return self._result(times, f"Stopped at t = {self.t:.10g}: {reason}.")
             arc = self.arcs[-1]
             if arc.status != Status.EVENT or self.t >= t1:
