@@ -101,8 +101,8 @@ def test_evaluations_are_calls_of_the_force():
         return np.array([0.0, -9.81])
 
     result = swing(1.0, pendulum(force=force))
-    # each twenty begins twice, those of short steps at first; checks at start and end, among them a sample of the calls
-    looks = 2000 + 100 + 40 + 5 + 50 + 16
+    # each twenty begins twice, those of short steps at first; checks at start and end, among them repeated calls
+    looks = 2000 + 100 + 40 + 5 + 50 + 256
     assert 0 <= len(calls) - result.stats.n_evaluations <= looks and min(calls) >= 0.0 and max(calls) <= 1.0 + 1e-12
 
 

@@ -1,6 +1,7 @@
 """Test stops: impacts, rest in contact, release and Coulomb friction, against closed forms and their conditions."""
 
 import pickle
+import re
 
 import numpy as np
 import pytest
@@ -10,7 +11,8 @@ from tests.marks import slow
 from tests.problems import unconstrained
 from twoloop import ConstrainedSystem, ConstraintWarning, Status, Stop, load, solve_with_stops
 from twoloop.bodies import PlanarModel, SpatialModel
-from twoloop.impacts.friction import Tangents, Undetermined, coulomb_forces, impulses
+from twoloop.impacts.contact import Undetermined
+from twoloop.impacts.friction import Tangents, coulomb_forces, impulses
 
 GRAVITY = 9.81
 TIGHT = {"rtol": 1e-10, "atol": 1e-10}
@@ -535,4 +537,4 @@ def test_rebounds_beside_a_singular_position_end_the_run_by_name_if_at_all(above
     result = solve_with_stops(problem.system, problem.t_span, problem.q0, problem.v0, problem.stops, law="moreau")
     assert result.t[-1] > 0.47
     assert abs(result.q[5, -1] - above) < 1e-5
-    assert result.success or "rank" in result.message or "no motion can begin there" in result.message
+    assert result.success or re.search("rank|no motion can begin there|in a singular position", result.message)

@@ -74,10 +74,6 @@ def _unconstrained_accelerations(system: ConstrainedSystem, t: float, q: Array, 
     return accelerations
 
 
-class CannotBegin(ValueError):
-    """Error: no motion can begin at a state, which violates the constraints or is a singular position."""
-
-
 class Violation:
     """Violation of constraints by a state, measured by the change of coordinates (or velocities) that corrects it.
 
@@ -162,11 +158,11 @@ class Violation:
             return max(float((part[part > 0.0] / allowed[part > 0.0]).max(initial=0.0)) for part, allowed in parts)
 
     def refuse(self, name: str) -> None:
-        """Raise `CannotBegin` unless the state is consistent."""
+        """Raise unless the state is consistent."""
         if self.excess <= 1.0:
             return
         row = int(np.abs(self.values).argmax())
-        raise CannotBegin(
+        raise ValueError(
             f"{name} is not consistent with the constraints of {self.system.name!r}: max|{self.equation}| is "
             f"{abs(self.values[row]):.3g} (row {row}) at t = {self.t:g}; {self._remedy(name)}"
         )

@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from twoloop.checks.arguments import Array, shown
-from twoloop.checks.consistency import CannotBegin
 from twoloop.generate.derived_callbacks import derive_callbacks
 from twoloop.generate.graph import Affine, Derivative, Graph, Untraceable, symbol_array
 from twoloop.generate.program import MAX_TRACE_DIFFERENCE, N_COMPARED, TIME_SPACING, OperationTable
@@ -22,6 +21,10 @@ from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.fallbacks import equilibrating_units, independent_rows, solve_scaled
 from twoloop.run.run import Run
 from twoloop.run.singular_start import Branch, branch_at
+
+
+class Undetermined(ValueError):
+    """Error if the forces of stops and of sticking joints, or a motion with them, are not determined."""
 
 
 class Gap(NamedTuple):
@@ -224,7 +227,7 @@ class Accelerations:
         plan = DOP853().plan(system.n_q, 1e-8, 1e-8, False)
         self._run = Run(derived, plan, t, q, v, 1e-8, atol, None)
         if isinstance(branch_at(derived, t, self._run.state, self._run.rank, atol), Branch):  # the rank rises beside
-            raise CannotBegin(
+            raise Undetermined(
                 f"contact or friction of {system.name!r} must not begin in a singular position, as at t = {t:g}: the "
                 "constraints have lost rank there, but not beside it. Start a little before that position, or beyond"
             )

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.optimize import lsq_linear, nnls
 
 from twoloop.checks.arguments import Array
-from twoloop.impacts.contact import Gap, Gaps
+from twoloop.impacts.contact import Gap, Gaps, Undetermined
 from twoloop.problem.description import Stop
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.fallbacks import NEGLIGIBLE_RATIO, independent_rows, velocity_changes
@@ -33,10 +33,6 @@ UNIT_RATIO = 256.0  # units of forces are powers of this number, so that they ar
 MAX_OUTSIDE = 1e-9  # largest component of b outside the range of D that counts as rounding, relative to max|b|
 CLOSING_TOLERANCE = 1e-6  # largest acceleration (or rate) with which a stop may still close, relative to max|c|
 SLIDING_TOLERANCE = 1e-9  # largest acceleration that counts as rounding, relative to the sum of its terms
-
-
-class Undetermined(ValueError):
-    """Error if no admissible distribution of the load among sticking joints and stops is found."""
 
 
 class Tangents(NamedTuple):

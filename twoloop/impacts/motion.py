@@ -22,8 +22,8 @@ from twoloop.checks.arguments import (
     check_vector,
     shown,
 )
-from twoloop.checks.consistency import CannotBegin
-from twoloop.impacts.contact import Accelerations, ContactSystem, Gap, Gaps
+from twoloop.checks.consistency import is_consistent
+from twoloop.impacts.contact import Accelerations, ContactSystem, Gap, Gaps, Undetermined
 from twoloop.impacts.friction import (
     IDLE,
     MIN_COMPLIANCE,
@@ -34,7 +34,6 @@ from twoloop.impacts.friction import (
     Modes,
     Signs,
     StopFriction,
-    Undetermined,
     coulomb_forces,
     holding_forces,
     impulses,
@@ -146,11 +145,10 @@ class Motion:
             t_before = self.t
             try:
                 self._run_arc(self._resolve_contacts(), t1)
-            except (Undetermined, CannotBegin) as error:
+            except Undetermined as error:
                 if not self.arcs:
                     raise
-                reason = "no motion can begin there: " * isinstance(error, CannotBegin) + str(error)
-                return self._result(times, f"Stopped at t = {self.t:.10g}: {reason}.")
+                return self._result(times, f"Stopped at t = {self.t:.10g}: {error}.")
             arc = self.arcs[-1]
             if arc.status != Status.EVENT or self.t >= t1:
                 return self._result(times)
@@ -483,7 +481,12 @@ class Motion:
         if resting:  # the callbacks of an extended system call other callbacks, and cannot be traced
             needs_traces = isinstance(check_method(options["method"]), Taylor | Lobatto16)
             options |= {"method": PRESETS["auto"] if needs_traces else options["method"], "compiled": False}
-        arc = solve_dae(system, (self.t, t1), self.q, self.v, events=events, dense_output=True, **options)
+        try:
+            arc = solve_dae(system, (self.t, t1), self.q, self.v, events=events, dense_output=True, **options)
+        except ValueError as error:
+            if self.arcs and not is_consistent(system, self.t, self.q, self.v):
+                raise Undetermined(f"no motion can begin there; {error}") from error
+            raise
         if arc.status == Status.EVENT and t1 - arc.t[-1] <= NEAR * np.spacing(abs(t1)):  # no time for another arc
             arc = solve_dae(system, (self.t, t1), self.q, self.v, dense_output=True, **options)
         self.arcs.append(arc)

@@ -175,7 +175,7 @@ class PythonFunctions:
         """Discard the samples, at the beginning of a run."""
         # (arguments, value) of a few calls of force, each 1.25 times as late as the last: repeated at the end of a run
         self.samples: list[tuple[tuple[Any, ...], Any]] = []
-        self._calls, self._next = 0, 1
+        self.n_calls, self._next = 0, 1  # n_calls: number of calls of force
 
     def call(self, kind: str, arguments: tuple[Any, ...], p: Address, out: Array) -> None:
         """Call one function with copies of the arrays, check the returned value and write it to `out`."""
@@ -189,8 +189,8 @@ class PythonFunctions:
             raise
         store(kind, self.name, t, value, out)
         if kind == "force":
-            self._calls += 1
-            if self._calls == self._next:
+            self.n_calls += 1
+            if self.n_calls == self._next:
                 self._next += 1 + self._next // 4
                 self.samples.append((tuple(np.copy(each) for each in arguments), out.copy()))
 

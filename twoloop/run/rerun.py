@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 from contextlib import suppress
+from itertools import cycle, islice
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -27,6 +28,9 @@ from twoloop.run.run import Run
 
 Array = NDArray[np.float64]
 
+# after a run, calls of a Python force are repeated: one for each CALLS_PER_REPETITION calls, but at most MAX_REPEATED.
+# So a force that changes in one of a hundred calls is found
+CALLS_PER_REPETITION, MAX_REPEATED = 8, 256
 FIRST_FORCE = "first force"  # key of `system.derived`: value of an untraced `force` at the start of a run
 N_DERIVATIVES = 4  # number of states of a run at which derivatives are checked after the run, including the last state
 
@@ -154,14 +158,15 @@ def describe_changed_force(run: Run) -> str | None:
     """
     system, functions = run.system, python_functions(run.system)
     if functions is None:
-        samples, force = system.derived.get(FIRST_FORCE, []), system.force
+        samples, force, n_repeated = system.derived.get(FIRST_FORCE, []), system.force, 1
     else:
         samples, force = functions.samples.copy(), functions.functions["force"]
+        n_repeated = max(len(samples), min(MAX_REPEATED, functions.n_calls // CALLS_PER_REPETITION))
     if not samples or run.control[run.a.FIXED_STEP] != 0.0:
         return None
     with warnings.catch_warnings(), np.errstate(all="ignore"):
         warnings.simplefilter("ignore")
-        for arguments, value in samples:
+        for arguments, value in islice(cycle(samples), n_repeated):
             try:
                 new_value = np.asarray(force(float(arguments[0]), *map(np.copy, arguments[1:])))
             except Exception:  # the state is outside the domain of the force
