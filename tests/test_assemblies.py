@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tests.problems import pendulum_state, quick, run, unconstrained, worst
-from twoloop import mechanisms, solve_dae
+from twoloop import consistent_state, mechanisms, solve_dae
 from twoloop.bodies import SpatialModel
 from twoloop.mechanisms import driven_slider_crank, four_bar
 
@@ -125,3 +125,19 @@ def test_rows_that_come_to_depend_on_each_other_give_way_to_a_redundant_one(meth
     result = solve_dae(system, (0.0, 4.0), q0, v0, method, 1e-12, 1e-12)
     assert result.success, result.message
     assert worst(result.q[:, -1], expected.q[:, -1]) < 1e-10
+
+
+@pytest.mark.parametrize("noise", [1e-6, 1e-4])
+def test_guesses_of_long_chains_with_redundant_hinges_are_projected(noise):
+    """In a chain of 14 boxes, each hinged twice, needed rows are as nearly dependent as redundant ones off the rows."""
+    model, before = SpatialModel(), "ground"
+    for k in range(14):
+        model.box(f"box {k}", (0.8, 0.3, 0.3), mass=1.0, position=(k + 0.5, 0.0, 0.0))
+        for y in (-0.2, 0.2):
+            model.revolute(before, f"box {k}", at=(k, y, 0.0), axis=(0.0, 1.0, 0.0), name=f"hinge {k} at {y}")
+        before = f"box {k}"
+    problem = model.problem()
+    guess = problem.q0 + noise * np.random.default_rng(3).standard_normal(problem.system.n_q)
+    q, _ = consistent_state(problem.system, 0.0, guess, problem.v0)
+    assert np.abs(q - guess).max() < 100.0 * noise
+    np.testing.assert_allclose(problem.system.constraint(0.0, q), 0.0, atol=1e-13)

@@ -18,6 +18,7 @@ import twoloop
 from tests.problems import at_one, pendulum, quick, run, swing, worst
 from tests.processes import ROOT
 from twoloop import Result, Statistics, Status
+from twoloop.bodies import PlanarModel
 from twoloop.mechanisms import closed_chain, four_bar
 from twoloop.run import loop
 
@@ -312,3 +313,16 @@ def test_nothing_in_a_file_ends_the_process(saved, tmp_path):
         except ValueError:
             refused.append(True)
     assert sum(refused) > 60 and not all(refused)  # both ways were tried
+
+
+@pytest.mark.filterwarnings("ignore:the constraints of:twoloop.ConstraintWarning")
+def test_a_dense_result_with_more_rows_than_coordinates_is_read_back(tmp_path):
+    model = PlanarModel()
+    model.rod("rod", (0.0, 0.0), (1.0, 0.0), mass=1.0)
+    model.revolute("ground", "rod", at=(0.0, 0.0), name="hinge")
+    for name in ("drive", "the same again"):
+        model.drive("hinge", lambda t: 2.0 * t, name=name)
+    problem = model.problem((0.0, 1.0))
+    result = run(problem, 1.0, dense_output=True)
+    result.save(tmp_path / "result.npz")
+    np.testing.assert_allclose(twoloop.load(tmp_path / "result.npz", problem.system).sol(0.3).q, result.sol(0.3).q)

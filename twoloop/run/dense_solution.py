@@ -57,7 +57,7 @@ def ranks_at(system: ConstrainedSystem, t: float, q: Array, v: Array, rtol: floa
     work = workspace(system, kit, pattern_of(system, t, q), q, rtol, 0.0)
     state = np.concatenate([q, v, np.zeros(system.n_q + system.n_c + system.n_a)])
     if advance.start(kit, work, t, state) != indices.RANK_DIFFERS:
-        return system.n_c, system.n_c + system.n_a
+        return min(system.n_c, system.n_q), min(system.n_c + system.n_a, system.n_q)
     return int(work.notes[indices.RANK]), int(work.notes[indices.RANK_V])
 
 

@@ -187,8 +187,9 @@ MAX_ITERATIONS = 50  # largest number of Gauss-Newton iterations
 # the iteration ends if violation / allowed violation is at most this, and the last step has not halved the violation
 CONVERGED_VIOLATION = 1e-2
 # singular values of C_q count as zero below these fractions of the largest one. RANK_CUTOFF: for ranks. LSTSQ_CUTOFF:
-# for least-squares solutions. REDUNDANT_CUTOFF: for least-squares solutions with redundant rows
-RANK_CUTOFF, LSTSQ_CUTOFF, REDUNDANT_CUTOFF = 1e-10, 1e-13, 1e-2
+# for least-squares solutions. REDUNDANT_CUTOFFS: for least-squares solutions with redundant rows, tried in this order:
+# off the constraints, redundant rows are only nearly dependent; in long chains, so are rows that are needed
+RANK_CUTOFF, LSTSQ_CUTOFF, REDUNDANT_CUTOFFS = 1e-10, 1e-13, (1e-2, 1e-3, 1e-4, 1e-5)
 # a dead centre is near if the ratio of the smallest to the largest singular value of C_q is at most this
 DEAD_CENTRE_RATIO = 0.01
 MAX_EQUAL_DISTANCE = 0.1  # projected guesses are equal if their distance / (largest change by projection) is below this
@@ -351,9 +352,11 @@ def _projected_position(
         raise ValueError(_describe_no_freedom(system, t, scaled, free, kept, why))
     position, excess, iterations = _gauss_newton(system, t, guess, free)
     has_redundant_rows = position is None or _rank(scales.scaled(system.jacobian(t, position))) < system.n_c
-    cutoff = REDUNDANT_CUTOFF if has_redundant_rows else LSTSQ_CUTOFF
-    if has_redundant_rows:  # use a larger cutoff: off the constraints, redundant rows are only nearly dependent
+    cutoff = LSTSQ_CUTOFF
+    for cutoff in REDUNDANT_CUTOFFS if has_redundant_rows else ():
         position, excess, iterations = _gauss_newton(system, t, guess, free, cutoff)
+        if position is not None and excess <= 1.0:
+            break
     if position is None or not excess <= 1.0:
         has_diverged = position is None
         largest = _format_largest(system.constraint(t, guess if has_diverged else position))
