@@ -20,7 +20,7 @@ from studies.bench.render import listed, render, table
 from studies.bench.store import PARTS, Output, command_of, read_rows
 
 Make = Callable[[Output], pd.DataFrame]
-MOST_NAMED = 3  # commits and processors of rows that a stamp names one by one
+MOST_NAMED = 2  # commits and processors of rows that a stamp names one by one
 NAMED = ("group", "case", "family", "solver", "way")  # columns by whose names rows are measured again
 
 
