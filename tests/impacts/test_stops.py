@@ -522,6 +522,24 @@ def test_stops_that_depend_on_one_another_keep_their_conditions(joints):
     assert n_solved > 100
 
 
+def test_a_light_ball_that_collapses_between_two_others_ends_with_their_velocity():
+    """At 1e-11, rounding hid the gap of a stop that was closing again: it shared an impact, and bounced once more."""
+    model, masses = PlanarModel((0.0, 0.0)), (0.47776244890564024, 0.00577433267140068, 1.7046949024050737)
+    places = 0.44213526128533326, 1.3571069468442092, 2.1239941769481088
+    rates, restitutions = (
+        (0.1975431553859459, 0.4844152942234403, -0.9068865266179088),
+        (0.6810991843322441, 0.7818419880526322),
+    )
+    for j, (mass, x, rate) in enumerate(zip(masses, places, rates, strict=True)):
+        model.body(f"ball {j}", mass=mass, inertia=1.0, position=(x, 0.0), velocity=(rate, 0.0))
+        model.prismatic("ground", f"ball {j}", at=(x, 0.0), axis=(1.0, 0.0))
+        if j:
+            feet, given = ((x, 0.0), f"ball {j - 1}", (places[j - 1], 0.0)), {"restitution": restitutions[j - 1]}
+            model.stop(f"ball {j}", *feet, normal=(1.0, 0.0), **given)
+    _, result = moved(model, 3.0, rtol=1e-11, atol=1e-11)
+    np.testing.assert_allclose(result.v[::3, -1], np.dot(masses, rates) / sum(masses), rtol=1e-8)
+
+
 @pytest.mark.filterwarnings("ignore::twoloop.ConstraintWarning")
 @pytest.mark.parametrize("above", [1e-6, 0.0])
 def test_rebounds_beside_a_singular_position_end_the_run_by_name_if_at_all(above):

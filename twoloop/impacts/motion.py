@@ -204,10 +204,14 @@ class Motion:
         near_stops = np.flatnonzero(gap.g <= reach)
         is_slow = np.zeros(near_stops.size, dtype=bool)
         if near_stops.size:
+            n_unfinished = len(self.unfinished_sequences)
             if self._follow_impacts(gap, near_stops):
                 gap = self.gaps.evaluate(self.t, self.q, self.v)
-                # stops that are still open will be hit later, in impacts of their own
-                open_stops = (gap.g > self.noise) & (gap.u < -REST_RATE * (np.abs(gap.W) @ self.speeds))
+                # stops that a finished sequence leaves closing will be hit later, in impacts of their own: they are
+                # open, even if rounding hides their gaps
+                is_finished = len(self.unfinished_sequences) == n_unfinished
+                is_closing = gap.u < -REST_RATE * (np.abs(gap.W) @ self.speeds)
+                open_stops = is_closing & (is_finished | (gap.g > self.noise))
                 near_stops = np.flatnonzero((gap.g <= reach) & ~open_stops)
             for _ in range(MAX_STALLED_ARCS if near_stops.size else 0):
                 is_slow = self._apply_impulses(gap, near_stops)
