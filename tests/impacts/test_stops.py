@@ -12,7 +12,7 @@ from tests.problems import unconstrained
 from twoloop import ConstrainedSystem, ConstraintWarning, Status, Stop, load, solve_with_stops
 from twoloop.bodies import PlanarModel, SpatialModel
 from twoloop.impacts.contact import Undetermined
-from twoloop.impacts.friction import Tangents, coulomb_forces, impulses
+from twoloop.impacts.forces import Tangents, coulomb_forces, impulses
 
 GRAVITY = 9.81
 TIGHT = {"rtol": 1e-10, "atol": 1e-10}
@@ -450,6 +450,39 @@ def test_a_thrown_box_comes_to_rest():
         assert result.arcs[-1].system.name.count("sticks") == 2
         ends.append(np.append(result.q[:, -1], [impact.t for impact in result.impacts[:8]]))
     np.testing.assert_allclose(*ends, atol=1e-6)
+
+
+@pytest.mark.parametrize(("n", "speed", "coefficient", "restitution"), [(2, 2.0, 0.3, 0.0), (3, 0.7, 0.1, 0.4)])
+def test_hinged_boxes_that_land_flat_slide_and_stop_as_one(n, speed, coefficient, restitution):
+    """Their 2 n stops share the weight in any proportion; impacts and sliding slow them by mu times its impulse."""
+    model = PlanarModel(name="train")
+    for k in range(n):
+        model.box(f"box {k}", (0.4, 0.2), mass=1.0 + k, position=(0.4 * k, 0.2), velocity=(speed, 0.0))
+        if k:
+            model.revolute(f"box {k - 1}", f"box {k}", at=(0.4 * k - 0.2, 0.2))
+        for side in (-0.18, 0.18):
+            given = {"normal": (0.0, 1.0), "restitution": restitution, "friction": coefficient}
+            model.stop(f"box {k}", (0.4 * k + side, 0.1), "ground", (0.0, 0.0), **given)
+    result = slid(model.problem(), 1.0, law="moreau")
+    fall = np.sqrt(2.0 * 0.1 * GRAVITY)  # speed of the first impact, m/s
+    x, v, t, u = 0.0, speed, fall / GRAVITY, fall
+    x += v * t
+    while u > 1e-9:
+        v, u = max(0.0, v - coefficient * (1.0 + restitution) * u), restitution * u
+        x, t = x + v * 2.0 * u / GRAVITY, t + 2.0 * u / GRAVITY
+    rest = min(1.0 - t, v / (coefficient * GRAVITY))
+    x, v = x + rest * (v - 0.5 * coefficient * GRAVITY * rest), v - coefficient * GRAVITY * rest
+    assert result.success, result.message
+    np.testing.assert_allclose(result.q[0, -1], x, atol=1e-6)
+    np.testing.assert_allclose(result.v[:, -1].reshape(n, 3), [[v, 0.0, 0.0]] * n, atol=1e-6)
+
+
+def test_loads_that_stops_share_in_any_proportion_with_different_friction_are_not_determined():
+    """Either of two stops at one place may carry the weight; how fast the body slows depends on which."""
+    D = np.array([[1.0, 1.0, 0.0, 0.0], [1.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 1.0], [0.0, 0.0, 1.0, 1.0]])
+    tangents = Tangents(np.array([0, 1]), np.array([0.1, 0.3]), np.array([1, 1]))
+    with pytest.raises(Undetermined, match="the motion depends on it"):
+        coulomb_forces(D, np.array([-9.81, -9.81, 0.0, 0.0]), np.zeros(0), tangents)
 
 
 def test_a_jam_is_said():

@@ -121,8 +121,8 @@ class ContactSystem:
     gaps, slides : Gaps
     closed : list of int
         Indices of the closed stops.
-    sticking : dict
-        Constant displacements of sticking stops along the surface, by index of the slide; they are constraints, too.
+    sticking, places : ndarray (k, n_slides), ndarray (k,)
+        Weights of the displacements of stops that stick together, and their constant sums, which are constraints, too.
     slipping : list of (int, int, float)
         For each stop that slides: its index in `closed`, the index of its slide, and its coefficient of friction times
         the direction of sliding (1 or -1).
@@ -134,12 +134,12 @@ class ContactSystem:
         gaps: Gaps,
         slides: Gaps,
         closed: list[int],
-        sticking: dict[int, float],
+        sticking: Array,
+        places: Array,
         slipping: list[tuple[int, int, float]],
     ):
         self._system, self._gaps, self._closed = system, gaps, closed
-        self._slides, self._sticking, self._slipping = slides, list(sticking), slipping
-        self._offsets = np.array(list(sticking.values()))
+        self._slides, self._sticking, self._places, self._slipping = slides, sticking, places, slipping
         # of the equations with friction, found by the first call of `force`: units, whether rows are redundant
         self._scaling: tuple[Array, bool] | None = None
         self._zero_velocity = np.zeros(system.n_q)
@@ -148,9 +148,9 @@ class ContactSystem:
     def _rows(self, part: str, t: float, q: Array, v: Array) -> Array:
         """Return one field of the `Gap` of the closed stops, followed by this field for the constant displacements."""
         rows = getattr(self._gaps.evaluate(t, q, v), part)[self._closed]
-        if not self._sticking:
+        if not len(self._sticking):
             return rows
-        return np.concatenate([rows, getattr(self._slides.evaluate(t, q, v), part)[self._sticking]])
+        return np.concatenate([rows, self._sticking @ getattr(self._slides.evaluate(t, q, v), part)])
 
     def _call(self, kind: str, t: float, *state: Array) -> Array:
         (values,) = self._system.arrays_of(kind)
@@ -160,7 +160,7 @@ class ContactSystem:
     def constraint(self, t: float, q: Array) -> Array:
         """Evaluate C, followed by the gaps."""
         gaps = self._rows("g", t, q, self._zero_velocity)
-        gaps[len(self._closed) :] -= self._offsets
+        gaps[len(self._closed) :] -= self._places
         return np.append(self._call("constraint", t, q), gaps)
 
     def jacobian(self, t: float, q: Array) -> Array:

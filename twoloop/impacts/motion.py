@@ -6,6 +6,7 @@ import inspect
 import time
 import warnings
 from collections.abc import Sequence as Stops
+from contextlib import suppress
 from functools import partial
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -24,6 +25,7 @@ from twoloop.checks.arguments import (
 )
 from twoloop.checks.consistency import is_consistent
 from twoloop.impacts.contact import Accelerations, ContactSystem, Gap, Gaps, Undetermined
+from twoloop.impacts.forces import SLIDING_TOLERANCE, coulomb_forces, holding_forces, impulses, responses
 from twoloop.impacts.friction import (
     IDLE,
     MIN_COMPLIANCE,
@@ -34,10 +36,6 @@ from twoloop.impacts.friction import (
     Modes,
     Signs,
     StopFriction,
-    coulomb_forces,
-    holding_forces,
-    impulses,
-    responses,
 )
 from twoloop.impacts.joined import Impact, join_arcs
 from twoloop.impacts.sequence import Impacts, ImpactWarning, Sequence
@@ -255,7 +253,8 @@ class Motion:
         friction_contacts = [
             (k, end + i, int(slides[i])) for i, k in enumerate(friction_stops) if is_pushing[tangents.normal[i]]
         ]
-        sticks = self.friction.sticking_groups(D, basis, {k: row for k, row, sign in friction_contacts if not sign})
+        sticking_rows = {k: row for k, row, sign in friction_contacts if not sign}
+        sticks = self.friction.sticking_groups(D, basis, sticking_rows, n, force)
         sliding_stops = {k: sign for k, _, sign in friction_contacts if sign}
         return Mode(signs, tuple(closing_stops[is_pushing].tolist()), sliding_stops, sticks)
 
@@ -336,7 +335,14 @@ class Motion:
         g, together = gap.g[reach].copy(), self.law != "sequential"
         tied_stops = np.flatnonzero(np.isin(reach, first) & (g <= max(self.noise, TIED_GAPS * self.rebound_height)))
 
-        def differ(order_a: Sequence, order_b: Sequence) -> bool:
+        def follow_order(gaps: Array, together: bool) -> Sequence | None:  # None: its impacts are not determined
+            with suppress(Undetermined):
+                return impacts.follow(gaps, u, limit, together)
+            return None
+
+        def differ(order_a: Sequence | None, order_b: Sequence | None) -> bool:
+            if order_a is None or order_b is None:
+                return True
             change = np.abs(X @ (order_a.impulses - order_b.impulses)).max()
             return bool(change > MAX_DIFFERENCE * np.abs(X @ order_a.impulses).max())
 
@@ -347,7 +353,7 @@ class Motion:
                 in_order = g.copy()
                 in_order[tied_stops] = np.maximum(g[tied_stops], 2.0 * self.noise)
                 in_order[k] = 0.0
-                orders.append(impacts.follow(in_order, u, limit, together))
+                orders.append(follow_order(in_order, together))
             is_ambiguous = any(differ(order, orders[0]) for order in orders)
             if is_ambiguous:
                 g[tied_stops] = 0.0
@@ -360,7 +366,7 @@ class Motion:
         if (
             self.law is None
             and sequence.has_shared_impacts
-            and (is_ambiguous or differ(impacts.follow(g, u, limit, False), sequence))
+            and (is_ambiguous or differ(follow_order(g, False), sequence))
         ):
             event = "stops close at once, in an order within the tolerance" if is_ambiguous else TOUCHING_EVENT
             self.law_dependent_impacts.append(
@@ -388,9 +394,14 @@ class Motion:
         is_pressed = u * np.abs(u) <= PRESSED_RATIO * height * np.abs(c).max() + rounding
         W = np.vstack([gap.W[near[is_pressed]], self.modes.gradients(self.q)[resting_joints]])
         D, n = W @ responses(self.system, self.t, self.q, W), int(is_pressed.sum())
-        force = holding_forces(D, np.append(c[is_pressed], c_joints), n, self._available_friction(resting_joints))
+        c_all = np.append(c[is_pressed], c_joints)
+        force = holding_forces(D, c_all, n, self._available_friction(resting_joints))
+        acceleration, terms = (D @ force + c_all)[:n], (np.abs(D) @ np.abs(force) + np.abs(c_all))[:n]
+        pressures = (D.diagonal() * force)[:n]
+        # stops that share a load in any proportion are all pressed, even if the others carry it
+        pressures[(force[:n] == 0.0) & (np.abs(acceleration) <= SLIDING_TOLERANCE * terms)] = pressures.max(initial=0.0)
         pressure = np.zeros(len(near))
-        pressure[is_pressed] = (D.diagonal() * force)[:n]
+        pressure[is_pressed] = pressures
         return np.asarray(u * np.abs(u) <= 2.0 * height * pressure + rounding, dtype=bool)
 
     def _sliding_directions(self, v: Array) -> tuple[Signs, list[int]]:
@@ -424,13 +435,17 @@ class Motion:
             return self._contact_systems[key][1]
         sticking = {k for group in mode.sticking_groups.values() for k in group}
         names = ", ".join(f"{self.stops[k].name}{' (sticks)' if k in sticking else ''}" for k in resting)
-        displacements = friction.slides.evaluate(self.t, self.q, self.v).g
-        sticks = {friction.slide_index[k]: float(displacements[friction.slide_index[k]]) for k in mode.sticking_groups}
+        sticks = np.zeros((len(mode.sticking_groups), friction.slides.n))
+        for row, shares in enumerate(mode.sticking_groups.values()):
+            sticks[row, [friction.slide_index[k] for k in shares]] = list(shares.values())
+        places = sticks @ friction.slides.evaluate(self.t, self.q, self.v).g
         sliding_stops = [
             (resting.index(k), friction.slide_index[k], sign * friction.coefficient(k))
             for k, sign in mode.sliding_stops.items()
         ]
-        extended = ContactSystem(system, self.gaps, friction.slides, list(resting), sticks, sliding_stops).build(names)
+        extended = ContactSystem(
+            system, self.gaps, friction.slides, list(resting), sticks, places, sliding_stops
+        ).build(names)
         if cached:
             self._contact_systems[key] = system, extended
         return extended
@@ -464,7 +479,7 @@ class Motion:
             row = free_system.n_c + resting.index(k)
             return make_terminal(lambda t, q, v: -multiplier(row, t, q, v))
 
-        def friction_balance(row: int, group: list[int], t: float, q: Array, v: Array) -> tuple[float, float]:
+        def friction_balance(row: int, group: dict[int, float], t: float, q: Array, v: Array) -> tuple[float, float]:
             loads = [(free_system.n_c + resting.index(k), self.friction.coefficient(k)) for k in group]
             return multiplier(row, t, q, v), sum(-mu * multiplier(normal, t, q, v) for normal, mu in loads)
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.checks.arguments import Array
-from twoloop.impacts.friction import Tangents, impulses
+from twoloop.impacts.forces import Tangents, impulses
 
 MAX_HITS = 20_000  # largest number of impacts of a sequence; more than 10,000 occur with mass ratios of 1e8
 MIN_RATE_RATIO = 1e-11  # largest rate, relative to the fastest closing rate, of a sequence that has died out
