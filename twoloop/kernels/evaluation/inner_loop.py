@@ -31,7 +31,6 @@ from twoloop.kernels.evaluation.operations import gamma_by_program
 from twoloop.kernels.evaluation.partition import (
     CONTRACTION,
     MAX_ITERATIONS,
-    MIN_CORRECTION,
     ROUNDING_OF_CORRECTIONS,
     adopt_partition_of_midpoint,
     check_all_rows,
@@ -40,6 +39,7 @@ from twoloop.kernels.evaluation.partition import (
     factor_dependent_columns,
     find_null_space,
     is_rounding_of_positions,
+    projection_tolerance,
     record_entries,
     restore_positions,
     restore_velocities,
@@ -204,7 +204,7 @@ def project_state(f, w, t, q, v, theta, a, lam):
     directions that constraints allow turn by at most about d / w.pivot.
     """
     last_correction = np.inf
-    theta = max(theta, MIN_CORRECTION * w.rounded)
+    theta = projection_tolerance(w, theta, largest_of(q))
     for _ in range(MAX_ITERATIONS):
         code = _factor_rows_at(f, w, t, q, v)
         if code == DONE:
@@ -396,7 +396,7 @@ def generated_inner_loop(f, w, task, t, q, v, theta, a, lam):
         if f.own_accelerate(t, q, v, f.numbers, a):
             return DONE
     elif task == tasks.PROJECT:
-        tolerance, last_correction = max(theta, MIN_CORRECTION * w.rounded), np.inf
+        tolerance, last_correction = projection_tolerance(w, theta, largest_of(q)), np.inf
         for k in range(MAX_ITERATIONS):
             w.n_inner += 1
             w.n_factorizations += 1

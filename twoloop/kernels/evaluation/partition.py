@@ -406,10 +406,18 @@ AMPLIFICATION = 1e3
 # constraint C_i = 0 holds up to rounding if |C_i| is at most this fraction of its largest term: the largest |G_ij q_j|
 # over the coordinates q_j, with the Jacobian G = C_q
 ROUNDING_OF_ROWS = 2e-15
-MIN_CORRECTION = 10.0  # the tolerance of a projection is at least this multiple of w.rounded, the rounding error of q
+# the tolerance of a projection is at least this multiple of the rounding error of positions, ROUNDING_ERROR * max|q|
+MIN_CORRECTION, ROUNDING_ERROR = 10.0, 1e-15
+
 # let g be the largest |entry| of row i of the Jacobian C_q. Constraint i is violated if |C_i| exceeds this number times
 # g max(1, max|q|), or if |(C_q v + C_t)_i| exceeds this number times g max(1, max|v|)
 MAX_VIOLATION = 1e-7
+
+
+@merged
+def projection_tolerance(w, theta, size):
+    """Return the largest correction at which a projection has converged; size: max|q|, which may grow in a run."""
+    return max(theta, MIN_CORRECTION * max(w.rounded, ROUNDING_ERROR * size))
 
 
 @compiled

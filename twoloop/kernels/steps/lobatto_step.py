@@ -42,8 +42,8 @@ from twoloop.kernels.data.common import (
 )
 from twoloop.kernels.data.indices import DEFECT_GAP, DONE, ESTIMATE, LEAST, OUTER_DIVERGED, SINGULAR, UNSUITED
 from twoloop.kernels.evaluation.inner_loop import check_redundant_rows, project, renew_partition
-from twoloop.kernels.evaluation.partition import MIN_CORRECTION
-from twoloop.kernels.linalg.dense import copy
+from twoloop.kernels.evaluation.partition import projection_tolerance
+from twoloop.kernels.linalg.dense import copy, largest_of
 
 # indices in `options`
 (
@@ -264,7 +264,10 @@ def _project_ends(f, w, options, data, n, n_ends, out_t, out_state):
         for i in range(2 * n):
             data[begin_ends + LANES * (1 + i) + k] = out_state[row, i]
         data[field.VALID + k] = 1.0
-    tolerance = max(options[THETA], MIN_CORRECTION * w.rounded)
+    largest_q = 0.0
+    for row in range(n_ends):
+        largest_q = max(largest_q, largest_of(out_state[row, :n]))
+    tolerance = projection_tolerance(w, options[THETA], largest_q)
     f.correct_ends(data, f.own_numbers)
     for _ in range(4):
         f.project_ends(data, f.own_numbers)
