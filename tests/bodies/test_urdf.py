@@ -209,3 +209,32 @@ def test_what_is_wrong_is_named(arm, old, new, message):
     arm.write_text(arm.read_text().replace(old, new, 1))
     with pytest.raises(ValueError, match=message):
         read(arm)
+
+
+@pytest.mark.parametrize("given", [{}, {"leader": 2.0}, {"follower": 0.7}])
+def test_a_joint_that_mimics_another_follows_it_from_the_start_and_over_turns(tmp_path, given):
+    """The leader stays where it is; the follower is read before it."""
+    link = '<link name="{}"><inertial><mass value="1"/><inertia ixx="0.01" iyy="0.01" izz="0.02"/></inertial></link>'
+    joint = (
+        '<joint name="{}" type="continuous"><parent link="base"/><child link="{}"/><origin xyz="0 {} 0"/>'
+        '<axis xyz="0 0 1"/>{}</joint>'
+    )
+    mimic = '<mimic joint="leader" multiplier="-1.5" offset="0.25"/>'
+    parts = (
+        link.format("a"),
+        link.format("b"),
+        joint.format("follower", "b", 1, mimic),
+        joint.format("leader", "a", 0, ""),
+    )
+    path = tmp_path / "pair.urdf"
+    path.write_text(f'<robot name="pair"><link name="base"/>{"".join(parts)}</robot>', encoding="utf-8")
+    problem = from_urdf(path, positions=given).problem((0.0, 2.0), rates={"leader": 5.0})
+    assert problem.note == "1 degree of freedom."
+    angle = given.get("leader", (given["follower"] - 0.25) / -1.5 if "follower" in given else 0.0)
+    turned = {body.name: body.coordinates for body in problem.model.bodies}
+    for name, expected in (("a", angle), ("b", 0.25 - 1.5 * angle)):
+        e0, e3 = problem.q0[turned[name][3]], problem.q0[turned[name][6]]
+        assert 2.0 * np.arctan2(e3, e0) == pytest.approx(expected, abs=1e-12)
+    result = moved(problem)
+    turns = {name: np.ptp(problem.joint_coordinate(name).history(result)) for name in ("leader", "follower")}
+    assert turns == pytest.approx({"leader": 10.0, "follower": 15.0})

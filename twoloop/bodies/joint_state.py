@@ -22,7 +22,7 @@ from twoloop.checks.arguments import Array
 from twoloop.problem.system import ConstrainedSystem
 
 STEP = 0.25  # first continuation step towards the given positions, rad or in sizes of the model
-LEAST_STEP = 1e-3  # shortest continuation step, as a fraction of the whole way
+LEAST_STEP = 1e-3  # shortest continuation step, as a fraction of the whole way, or of the first step
 ITERATIONS, LAST_ITERATIONS = 8, 60  # largest numbers of Newton iterations: in a continuation step, in the last one
 LONGEST = 0.5  # longest Newton step, rad or in sizes of the model: shorter than the distance of two branches
 CONVERGED = 1e-13  # shorter Newton steps, rad or in sizes of the model, are rounding errors
@@ -92,8 +92,9 @@ def positions(
     if start is carried:
         begin = request.values
     q, done, part = start, 0.0, min(1.0, STEP / max(float(np.abs((request.values - begin) / sizes).max()), STEP))
-    while done < 1.0 and part > LEAST_STEP:
-        to = 1.0 if done + part > 1.0 - LEAST_STEP else done + part
+    shortest = LEAST_STEP if part > LEAST_STEP else LEAST_STEP * part
+    while done < 1.0 and part > shortest:
+        to = 1.0 if done + part > 1.0 - shortest else done + part
         new, left = solved(q, begin + to * (request.values - begin), ITERATIONS)
         if left <= OFF and np.abs((new - q) / units).max() <= LONGEST:
             q, done = new, to
@@ -233,7 +234,10 @@ def _least(rows: Array, right: Array, motions: Array, back: Array) -> tuple[Arra
     free = null_space(rows * weights[:, None], rcond=SINGULAR)
     if free.shape[1]:
         target = np.append(back, np.zeros(len(motions) - len(back)))
-        x = x + free @ np.linalg.lstsq(motions @ free, target - motions @ x, rcond=SINGULAR)[0]
+        moved = motions @ free  # nothing but rounding if the only free motion left is that of all bodies together
+        size, smallest = float(np.linalg.norm(moved)), SINGULAR * float(np.linalg.norm(motions))
+        if size > smallest:
+            x = x + free @ np.linalg.lstsq(moved, target - motions @ x, rcond=max(SINGULAR, smallest / size))[0]
     return np.asarray(x), left
 
 

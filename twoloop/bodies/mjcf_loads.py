@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -10,6 +12,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from twoloop.bodies.file_parts import (
+    SAME,
     FileJoint,
     Part,
     Pose,
@@ -24,7 +27,7 @@ from twoloop.bodies.file_parts import (
 from twoloop.bodies.frames import vector_of
 from twoloop.bodies.mjcf_actuators import FILTERS, TendonsAndActuators, activation_of, is_single, trimmed
 from twoloop.bodies.parameter_layout import HINGE_ROTOR, SLIDE_ROTOR
-from twoloop.bodies.parts import Body, Force, Numbers
+from twoloop.bodies.parts import Body, Force, ModelJoint, Numbers
 from twoloop.bodies.rotation import euler_parameters, rotation_matrix
 from twoloop.bodies.rotation_rates import euler_product, parameters_of, rate_of_vector, spin_of
 from twoloop.bodies.tendons import SpringTension
@@ -300,12 +303,27 @@ class Loads(TendonsAndActuators):
         text = given.get("polycoef", "").split()
         coefficients = numbers(" ".join([*text, *"01000"[len(text) :]]), 5, f"polycoef of a {kind} equality")
         own = self.reader.free(given.get("name"), f"equality of {' and '.join(names)}")
-        row = partial(polynomial, tuple(coefficients.tolist()), tuple(offsets))
-        self.model.coupling(ends, row, name=own)
+        couple(self.model, ends, offsets, tuple(coefficients.tolist()), own)
         return True
 
 
 READ = ("tendon", "equality", "actuator")  # sections, in order
+
+
+def couple(
+    model: Any, ends: Sequence[Any], offsets: Sequence[float], coefficients: tuple[float, ...], name: str
+) -> None:
+    """Make the first of two joints or tendons move as a polynomial of the second, or keep one in place.
+
+    Two hinges whose angles are proportional become gears, if the poses fit: gears may turn without limits.
+    """
+    hinges = [isinstance(end, ModelJoint) and end.kind == "revolute" for end in ends]
+    linear = len(ends) == 2 and all(hinges) and coefficients[1] != 0.0 and not any(coefficients[2:])
+    if linear and abs(polynomial(coefficients, (0.0, 0.0), *offsets)) <= SAME:
+        with suppress(ValueError):  # a ratio that is not one of whole numbers
+            model.gear(ends[1], ends[0], ratio=coefficients[1], name=name)
+            return
+    model.coupling(list(ends), partial(polynomial, coefficients, tuple(offsets)), name=name)
 
 
 def polynomial(coefficients: tuple[float, ...], offsets: tuple[float, ...], first: Any, *second: Any) -> Any:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import copy
 import pickle
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -18,6 +19,7 @@ from twoloop.bodies.drawings import drawing_of
 from twoloop.bodies.energy import ModelEnergy
 from twoloop.bodies.functions import motion_function
 from twoloop.bodies.joint_state import Request
+from twoloop.bodies.parameter_layout import ALONG
 from twoloop.bodies.parts import Body, DryFriction, ModelJoint, Numbers
 from twoloop.bodies.ropes import Ropes
 from twoloop.bodies.rotation import euler_rates
@@ -312,6 +314,20 @@ class Model(Ropes):
         turning = np.tile(np.arange(len(self.coordinate_names)) >= self.dimension, len(self.bodies))
         return Request(self.name, tuple(chosen), targets, tuple(others), joints, turning)
 
+    def _driven(self, t: float, q: Array, placed: Given) -> Iterator[tuple[str, str, float]]:
+        """Yield the coordinates of joints with a drive, and the drive's value at t, unless they are in `placed`."""
+        joints = {id(joint.point_b): joint for joint in self.joints if joint.kind in KINDS}
+        for drive in self.joints:
+            joint, row = joints.get(id(drive.point_b)), drive.rows[0]
+            if drive.kind != "drive" or joint is None or row.motion is None:
+                continue
+            which = "displacement" if row.kind == ALONG else "angle"
+            value = float(row.motion.at(t, q, q)[0])
+            if self.dimension == 3 and (joint.kind, which) in UNCOUNTED:
+                value = float(np.remainder(value + np.pi, 2.0 * np.pi) - np.pi)
+            if (joint.name, which) not in {each[:2] for each in placed}:
+                yield joint.name, which, value
+
     def assemble(
         self,
         t_span: tuple[float, float],
@@ -358,6 +374,9 @@ class Model(Ropes):
         )
         closed = q = loop_closure.positions(still, t_span[0], start, tree, driveless.rows, bounds, wanted)
         if driveless is not tables:
+            with suppress(ValueError):  # e.g. a drive beyond the reach of a loop: said by `follow_drives`
+                driven = self._request((*placed, *self._driven(t_span[0], q, placed)), measured)
+                q = joint_state.positions(still, t_span[0], q, driven, tree, keep) if driven.given else q
             q = assembly.follow_drives(system, t_span[0], q, keep)
         if placed:
             q = joint_state.positions(system, t_span[0], q, self._request(placed, measured), tree, keep)

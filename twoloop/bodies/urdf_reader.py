@@ -32,7 +32,7 @@ from twoloop.bodies.file_parts import (
     text_of,
 )
 from twoloop.bodies.loads import function_rows
-from twoloop.bodies.mjcf_loads import polynomial
+from twoloop.bodies.mjcf_loads import couple
 from twoloop.bodies.parameter_layout import POINT
 from twoloop.bodies.parts import Body, JointRow, ModelJoint, Numbers
 from twoloop.bodies.rotation import euler_parameters, perpendiculars
@@ -358,16 +358,35 @@ class _Reader:
     def _mimic(self, mimic: Element, freed: FileJoint) -> bool:
         """Couple a joint to the joint that it mimics; return False if a model does not support this."""
         leader = self.moved.get(mimic.get("joint", ""))
-        add_coupling = getattr(self.model, "coupling", None)
-        if add_coupling is None or leader is None or leader.joint is None:
+        if not hasattr(self.model, "coupling") or leader is None or leader.joint is None:
             return False
+        factor, offset = self._mimic_numbers(mimic, freed.name)
+        joints, offsets = [freed.joint, leader.joint], [freed.displacement, leader.displacement]
+        couple(self.model, joints, offsets, (offset, factor), f"mimic of {freed.name}")
+        return True
+
+    def _mimic_numbers(self, mimic: Element, name: str) -> tuple[float, float]:
+        """Return multiplier and offset of the mimic of a joint."""
         factor, offset = (
-            float(numbers(mimic.get(key, default), 1, f"{key} of the mimic of joint {freed.name!r}")[0])
+            float(numbers(mimic.get(key, default), 1, f"{key} of the mimic of joint {name!r}")[0])
             for key, default in (("multiplier", "1"), ("offset", "0"))
         )
-        row = partial(polynomial, (offset, factor), (freed.displacement, leader.displacement))
-        add_coupling([freed.joint, leader.joint], row, name=f"mimic of {freed.name}")
-        return True
+        return factor, offset
+
+    def _position(self, joint: Element, seen: tuple[str, ...] = ()) -> float:
+        """Return the given position of a joint; else the one that follows from a joint coupled by a mimic, or zero."""
+        name, mimic = _name(joint), joint.find("mimic")
+        if name in self.positions or name in seen:
+            return self.positions.get(name, 0.0)
+        for each in self.joints:  # the joint mimics `each`, or is mimicked by it
+            if mimic is not None and _name(each) == mimic.get("joint"):
+                factor, offset = self._mimic_numbers(mimic, name)
+                return factor * self._position(each, (*seen, name)) + offset
+            follows = each.find("mimic")
+            if follows is not None and follows.get("joint") == name and _name(each) in self.positions:
+                factor, offset = self._mimic_numbers(follows, _name(each))
+                return (self.positions[_name(each)] - offset) / factor if factor else 0.0
+        return 0.0
 
     def _type(self, joint: Element) -> str:
         name = _name(joint)
@@ -388,7 +407,7 @@ class _Reader:
         """Read the child link of a joint."""
         name, kind, child = _name(joint), self._type(joint), self._end(joint, "child")
         pose = outer.then(_origin(joint, f"origin of joint {name!r}"))
-        value = self.positions.get(name, 0.0)
+        value = self._position(joint) if kind in (*TURNING, *SLIDING) else self.positions.get(name, 0.0)
         if value and kind not in (*TURNING, *SLIDING):
             raise ValueError(f"positions has {name!r}, a {kind} joint, which has no angle or displacement")
         if kind == "fixed" or not self._matters(child):

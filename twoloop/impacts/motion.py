@@ -562,6 +562,8 @@ class Motion:
 
         def gap_function(t: float, q: Array, v: Array) -> float:
             g = float(self.gaps.evaluate(t, q, v).g[k])
+            if np.isnan(g):  # a step has gone beyond the limit of a hinge in space, to an angle that has no value
+                return -1.0
             if g0 > low or (closing and g0 > noise):
                 return g
             if opens:

@@ -45,9 +45,9 @@ class GearRow:
 
     def off(self, q: Array) -> float:
         """Return the angle from the tooth in mesh in the position given; zero if more than half a turn from it."""
-        one, other = (_angle(_rotation(q, each)) for each in (self.one, self.other))
+        one, other = float(self.one.position(q)), float(_angle(_rotation(q, self.other)))  # NaN about a whole turn
         meant = one * self.n / self.m
-        return float(other - meant) if max(abs(one), abs(meant)) < HALF_TURN else 0.0
+        return other - meant if max(abs(one), abs(meant)) < HALF_TURN else 0.0
 
 
 @documented
