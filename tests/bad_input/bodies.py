@@ -133,12 +133,6 @@ def five_bar(positions):
     return loop((0, 0), (0, 1), (1, 1.8), (2, 1), (2, 0)).problem(positions=positions)
 
 
-def half_a_turn():
-    model = hinged()
-    model.drive("hinge", lambda t: 2.5 + t)
-    return model.problem()
-
-
 def point_of_another():
     model = planar()
     return model.revolute("bar", "block", at=(model.bodies[1].point(0.0, 0.0), model.bodies[1].point(0.0, 0.0)))
@@ -221,7 +215,6 @@ BODIES: list[Case] = [
     of_problem("a velocity that joints do not allow", locked).says("do not allow the velocities given: the rate of angle of bar is given as 2", "give velocities of fewer bodies"),
     of_problem("a velocity across a skate", sideways).says("do not allow the velocities given: the rate of y of sledge is given as 1", "give one along the blade"),
     of_problem("two drives that contradict", two_drives, "the motion is over-constrained", "leave one of them out"),
-    of_problem("a drive that begins far away", half_a_turn).says("assembled half a turn from it", "give the bodies near to where the motion begins"),
     of_problem("a position that a loop does not permit", lambda: four_bar({"A": 1.0, "D": 0.2})).says("do not permit 0.2 rad as the angle of D together with those of 'A'; the nearest value found is", "give one of them: the other follows"),
     of_problem("a position of one of two cranks", lambda: five_bar({"A": 0.1})).says("do not determine the joint 'D', which has to move with those given", "give the other crank, too"),
     of_problem("rates that do not agree", lambda: four_bar(rates={"A": 1.0, "D": 0.2})).says("do not permit 0.2 rad/s as the rate of the angle of D together", "give one of them"),

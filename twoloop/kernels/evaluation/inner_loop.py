@@ -31,6 +31,7 @@ from twoloop.kernels.evaluation.operations import gamma_by_program
 from twoloop.kernels.evaluation.partition import (
     CONTRACTION,
     MAX_ITERATIONS,
+    MIN_CORRECTION,
     ROUNDING_OF_CORRECTIONS,
     adopt_partition_of_midpoint,
     check_all_rows,
@@ -204,7 +205,7 @@ def project_state(f, w, t, q, v, theta, a, lam):
     directions that constraints allow turn by at most about d / w.pivot.
     """
     last_correction = np.inf
-    theta = projection_tolerance(w, theta, largest_of(q))
+    theta = max(theta, MIN_CORRECTION * w.rounded)
     for _ in range(MAX_ITERATIONS):
         code = _factor_rows_at(f, w, t, q, v)
         if code == DONE:

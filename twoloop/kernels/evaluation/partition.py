@@ -416,7 +416,12 @@ MAX_VIOLATION = 1e-7
 
 @merged
 def projection_tolerance(w, theta, size):
-    """Return the largest correction at which a projection has converged; size: max|q|, which may grow in a run."""
+    """Return the largest correction at which a projection by generated code has converged; size: max|q|.
+
+    Angles may grow by thousands of rad in a run. Projections by a partition keep the tolerance of the start, and so do
+    all if a singular position was near: what a larger one leaves there may turn the motion to another branch.
+    """
+    size = 0.0 if w.nearly_singular == 1.0 else size
     return max(theta, MIN_CORRECTION * max(w.rounded, ROUNDING_ERROR * size))
 
 

@@ -51,9 +51,9 @@ from twoloop.kernels.evaluation.partition import (
     CONTRACTION,
     MAX_ITERATIONS,
     MAX_VIOLATION,
+    MIN_CORRECTION,
     ROUNDING_OF_CORRECTIONS,
     ROUNDING_OF_ROWS,
-    projection_tolerance,
 )
 from twoloop.kernels.linalg.dense import copy, has_new_entries, largest_of
 from twoloop.kernels.linalg.sparse_ldl import factor, fill_saddle_matrix, solve, solve_refined
@@ -442,7 +442,7 @@ def _project_state(f, w, t, q, v, tolerance):
     On return, the factors in w are those at q before the last correction.
     """
     last_correction = np.inf
-    tolerance = projection_tolerance(w, tolerance, largest_of(q))
+    tolerance = max(tolerance, MIN_CORRECTION * w.rounded)
     for _ in range(MAX_ITERATIONS):
         code = factor_equations_at(f, w, t, q)
         if code != DONE:
