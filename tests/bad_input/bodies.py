@@ -139,7 +139,7 @@ def point_of_another():
 
 
 BODIES: list[Case] = [
-    of_planar("a name twice", body(name="bar"), "'bar' is already taken", "give each part its own name"),
+    of_planar("a name twice", body(name="bar"), "'bar' is already taken by a body", "give each part its own name"),
     of_planar("`name=''`", body(name=""), "name must not be empty", "give a name"),
     of_planar("`name=3`", body(name=3), "name must be a string; given 3", "give text", TypeError),
     of_planar("`mass=-1`", body(mass=-1), "mass of 'arm' must be positive", "give a positive mass"),
