@@ -647,7 +647,7 @@ def solve_with_stops(
 
     Stops with friction slide or stick while they are closed, by Coulomb's law. In an impact, the impulse of friction
     stops the sliding, if the coefficient times the impulse of the stop suffices; otherwise it has that value and
-    opposes the sliding after the impact. A run ends where forces with friction are not unique (a jam), or where the
+    opposes the sliding after the impact. A run ends where friction leaves the motion undetermined (a jam), or where the
     law would add energy, as is possible for a large restitution.
 
     Parameters
