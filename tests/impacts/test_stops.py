@@ -477,6 +477,51 @@ def test_hinged_boxes_that_land_flat_slide_and_stop_as_one(n, speed, coefficient
     np.testing.assert_allclose(result.v[:, -1].reshape(n, 3), [[v, 0.0, 0.0]] * n, atol=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("floor", "face", "velocities"),
+    [
+        ([(0, 0.15, -0.15, 1.0)], (0.15, -0.15), [0.7, 0.0, 0.0, 0.7, 0.0, 0.0]),
+        ([(1, 0.15, -0.15, 1.0), (1, 0.0, 0.15, -1.0)], (-0.15,), [1.12, 0.0, -2.8, 0.28, 0.0, 2.8]),
+    ],
+)
+def test_boxes_that_meet_flush_do_not_rub(floor, face, velocities):
+    """Without a rate along the face, there is no friction; rounding is no such rate. By momentum: x' = 1.4 m/s."""
+    model = PlanarModel(gravity=(0.0, 0.0))
+    for k, speed in ((0, 1.4), (1, 0.0)):
+        model.box(f"box {k}", (0.3, 0.3), mass=1.0, position=(0.3 * k, 0.15), velocity=(speed, 0.0))
+    for k, x, y, side in floor:
+        at = (0.3 * k + x, 0.15 + y)
+        model.stop(f"box {k}", at, "ground", (0.0, at[1]), normal=(0.0, side), friction=0.3)
+    for y in face:
+        model.stop("box 1", (0.15, 0.15 + y), "box 0", (0.15, 0.15), normal=(1.0, 0.0), friction=0.4)
+    result = slid(model.problem(), 0.01, law="moreau")
+    assert result.success, result.message
+    np.testing.assert_allclose(result.v[:, -1], velocities, atol=1e-12)
+    (impact,) = result.impacts
+    assert np.abs(impact.friction).max() < 1e-14
+
+
+def test_forces_at_stops_with_friction_keep_coulombs_conditions():
+    """Up to four stops, many with dependent displacements or without any rate, of which some end as not determined."""
+    numbers, n_solved = np.random.default_rng(6), 0
+    for _ in range(300):
+        n, size = int(numbers.integers(1, 5)), int(numbers.integers(1, 5))
+        W = np.round(numbers.normal(size=(2 * n, size)))
+        D, c, mu = W @ W.T, W @ np.round(numbers.normal(size=size)), numbers.uniform(0.1, 1.0, n)
+        try:
+            x, slides = coulomb_forces(D, c, np.zeros(0), Tangents(np.arange(n), mu, np.zeros(n, dtype=np.int64)))
+        except Undetermined:
+            continue
+        n_solved += 1
+        after, close = D @ x + c, 1e-9 * (1.0 + np.abs(x).max())
+        N, T = x[:n], x[n:]
+        assert (N >= 0.0).all() and (after[:n] >= -close).all() and (N * after[:n] <= close * (1.0 + N)).all()
+        assert (np.abs(T) <= mu * N + close).all()
+        np.testing.assert_allclose(T[slides != 0], (-slides * mu * N)[slides != 0], atol=close)
+        assert (np.abs(after[n:])[slides == 0] <= close).all()
+    assert n_solved > 200
+
+
 def test_loads_that_stops_share_in_any_proportion_with_different_friction_are_not_determined():
     """Either of two stops at one place may carry the weight; how fast the body slows depends on which."""
     D = np.array([[1.0, 1.0, 0.0, 0.0], [1.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 1.0], [0.0, 0.0, 1.0, 1.0]])

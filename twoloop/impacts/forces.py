@@ -22,6 +22,7 @@ MAX_PIVOTS_PER_ROW = 20  # largest number of pivots of Lemke's method, per row
 PIVOT_TOLERANCE = 1e-11  # smallest pivot of Lemke's method, relative to its column
 # largest differences of ratios that count as equal in Lemke's method: rounding may end it if too few or too many do
 TIES = 1e-14, 1e-12, 1e-10
+ROUNDED = 2e-14  # largest acceleration or rate that counts as rounding, relative to others that act on it
 SOLVED = 1e-9  # largest violation of a solution, relative to its largest number
 # Lemke's method is repeated along other paths; accelerations that differ by more than PATH_TOLERANCE are not unique
 N_OTHER_PATHS, PATH_TOLERANCE = 2, 1e-6
@@ -123,22 +124,34 @@ def _forces_in_units(D: Array, c: Array, limit: Array, tangents: Tangents) -> tu
     n = len(c) - len(limit) - n_tangents
     if not n_tangents:
         return holding_forces(D, c, n, limit), np.zeros(0, dtype=int)
-    x = _lemke_forces(D, c, limit, tangents, np.ones(len(c)))
+    first_tangent = len(c) - n_tangents
+    acts_on = np.abs(D) > COUPLING_TOLERANCE
+    acts_on[np.arange(first_tangent, len(c)), tangents.normal] = True
+    # contacts that do not act on one another have units and rounding errors of their own
+    component = connected_components(acts_on)[1]
+
+    def largest(values: Array) -> Array:
+        return np.array([values[component == k].max() for k in component])
+
+    sizes = largest(np.abs(c))
+    c = np.where(np.abs(c) <= ROUNDED * sizes, 0.0, c)
+    x = _lemke_forces(D, c, limit, tangents, sizes, np.ones(len(c)))
     if x is None:
         raise Undetermined("friction of stops is so large that no forces of the stops are possible: they may jam")
-    acceleration, terms = D @ x + c, np.abs(D) @ np.abs(x) + np.abs(c)
-    for weights in np.random.default_rng(5).uniform(0.5, 2.0, (N_OTHER_PATHS, len(c))):
-        other = _lemke_forces(D, c, limit, tangents, weights)
-        if other is not None and (np.abs(D @ other + c - acceleration) > PATH_TOLERANCE * terms.max()).any():
+    x[np.abs(x) <= ROUNDED * sizes] = 0.0  # all compliances are about one
+    acceleration, terms = D @ x + c, largest(np.abs(D) @ np.abs(x) + np.abs(c))
+    for weights in np.random.default_rng(5).uniform(0.5, 2.0, (N_OTHER_PATHS if n > 1 else 0, len(c))):
+        other = _lemke_forces(D, c, limit, tangents, sizes, weights)
+        if other is not None and (np.abs(D @ other + c - acceleration) > PATH_TOLERANCE * terms).any():
             raise Undetermined(
                 "stops share their loads in any proportion, and with their friction the motion depends on it"
             )
     acceleration_signs = np.sign(acceleration) * (np.abs(acceleration) > SLIDING_TOLERANCE * terms)
-    slides = np.where(tangents.sign != 0, tangents.sign, acceleration_signs[len(c) - n_tangents :]).astype(int)
+    slides = np.where(tangents.sign != 0, tangents.sign, acceleration_signs[first_tangent:]).astype(int)
     return _solve_contacts(D, c, x, n, tangents._replace(sign=slides)), slides
 
 
-def _lemke_forces(D: Array, c: Array, limit: Array, tangents: Tangents, weights: Array) -> Array | None:
+def _lemke_forces(D: Array, c: Array, limit: Array, tangents: Tangents, sizes: Array, weights: Array) -> Array | None:
     """Return forces x = B z by the complementarity problem of D. E. Stewart and J. C. Trinkle (1996); None: none exist.
 
     z holds the forces of stops, of friction at rest in either direction, and the sliding rates s that may begin:
@@ -164,12 +177,7 @@ def _lemke_forces(D: Array, c: Array, limit: Array, tangents: Tangents, weights:
     loads[len(limit) + np.arange(n_tangents), tangents.normal] = tangents.coefficient
     A[n + 2 * m :, :n] = loads[is_bounded]
     b[n + 2 * m :] = np.append(limit, np.zeros(n_tangents))[is_bounded]
-    # contacts that do not act on one another get units of their own, so that all are equally accurate
-    acts_on = np.abs(D) > COUPLING_TOLERANCE
-    acts_on[first_tangent + np.arange(n_tangents), tangents.normal] = True
-    component = connected_components(acts_on)[1]
-    sizes = np.array([np.abs(c[component == k]).max() for k in component])
-    units = np.concatenate([sizes[:n], np.tile(sizes[bounded], 3)])
+    units = np.concatenate([sizes[:n], np.tile(sizes[bounded], 3)])  # of the forces
     units[units == 0.0] = 1.0
     A, b, d = A * units / units[:, None], b / units, np.concatenate([weights[:n], np.tile(weights[bounded], 3)])
     for tie in TIES:
@@ -233,9 +241,12 @@ def lemke(A: Array, b: Array, d: Array, tie: float) -> Array | None:
 
 
 def _solve_contacts(D: Array, c: Array, x: Array, n: int, tangents: Tangents) -> Array:
-    """Solve the linear equations for the forces at stops whose states are known; forces of joints remain unchanged."""
+    """Correct the forces x at stops whose states are known by the linear equations; forces of joints do not change.
+
+    The least correction keeps loads that may be shared in any proportion as x shares them.
+    """
     tangent_rows = np.arange(len(c) - len(tangents.normal), len(c))
-    is_pushing = np.append(x[:n] > 0.0, np.zeros(len(c) - n, dtype=bool))
+    is_pushing = np.append(x[:n] > NEGLIGIBLE_RATIO * np.abs(x).max(), np.zeros(len(c) - n, dtype=bool))
     loads = np.zeros((len(c), len(c)))  # x = loads @ y; y: forces of stops, and of friction at rest
     loads[is_pushing, is_pushing] = 1.0
     loads[tangent_rows, tangents.normal] = -tangents.sign * tangents.coefficient * is_pushing[tangents.normal]
@@ -247,8 +258,9 @@ def _solve_contacts(D: Array, c: Array, x: Array, n: int, tangents: Tangents) ->
         raise Undetermined("friction of stops is so large that their forces are not unique (P. Painlevé): they may jam")
     fixed_forces = np.where(is_pushing, 0.0, x)
     fixed_forces[tangent_rows] = 0.0
-    y = np.zeros(len(c))
-    y[is_held] = np.linalg.lstsq(A, -(c + D @ fixed_forces)[is_held], rcond=NEGLIGIBLE_RATIO)[0]
+    y = np.where(is_held, x, 0.0)
+    left = (c + D @ (loads @ y + fixed_forces))[is_held]
+    y[is_held] -= np.linalg.lstsq(A, left, rcond=NEGLIGIBLE_RATIO)[0]
     return np.asarray(loads @ y + fixed_forces)
 
 

@@ -228,7 +228,13 @@ class Motion:
         friction_stops, slide, tangents = self.friction.contact_rows(
             closing_stops.tolist(), self.t, self.q, self.v, self.speeds
         )
-        c = np.concatenate([gap.W[closing_stops] @ a + gap.bias[closing_stops], c_joints, slide.W @ a + slide.bias])
+        c = np.concatenate(
+            [
+                without_rounding(gap.W @ a + gap.bias, gap.W, a, gap.bias)[closing_stops],
+                c_joints,
+                without_rounding(slide.W @ a + slide.bias, slide.W, a, slide.bias),
+            ]
+        )
         W = np.vstack([gap.W[closing_stops], self.modes.gradients(self.q)[resting_joints], slide.W])
         D = W @ responses(self.system, self.t, self.q, W)
         n, end = len(closing_stops), len(closing_stops) + len(resting_joints)
@@ -282,8 +288,7 @@ class Motion:
         W = np.vstack([gap.W[near], slide.W])
         X = responses(self.system, self.t, self.q, W)  # dry friction of joints causes no impulse
         D, n = W @ X, len(near)
-        v_before, u = self.v, np.append(gap.u[near], slide.u)
-        u[np.abs(u) <= ROUNDING * (np.abs(W) @ self.speeds)] = 0.0
+        v_before, u = self.v, without_rounding(np.append(gap.u[near], slide.u), W, self.speeds)
         P = impulses(D, u, self.restitution[near], tangents, self.law)
         v = v_before + X @ P
         is_slow = self._has_low_rebound(near, v)
@@ -324,8 +329,10 @@ class Motion:
         )
         W = np.vstack([gap.W[reach], slide.W])
         X = responses(self.system, self.t, self.q, W)
-        u = np.append(np.where(np.abs(gap.u) <= at_rest, 0.0, gap.u)[reach], slide.u)
-        impacts = Impacts(W @ X, self.restitution[reach], tangents, self.noise, rounding[reach], self.law)
+        slide_rates = without_rounding(slide.u, slide.W, self.speeds)
+        u = np.append(np.where(np.abs(gap.u) <= at_rest, 0.0, gap.u)[reach], slide_rates)
+        data = W @ X, self.restitution[reach], tangents, self.noise, rounding[reach], self.law
+        impacts = Impacts(*data, self.deadline)
         a = self._free_accelerations(*self._sliding_directions(self.v), self.v)[0]
         largest_v, largest_a = float(np.abs(self.v).max()), float(np.abs(a).max())
         limit = min(
@@ -359,7 +366,7 @@ class Motion:
                 g[tied_stops] = 0.0
         sequence = impacts.follow(g, u, limit, together)
         P, v_before, n = sequence.impulses, self.v, len(reach)
-        names = [self.stops[k].name for k in reach[P[:n] > 0.0]]
+        names = [self.stops[k].name for k in (reach[P[:n] > 0.0] if (P[:n] > 0.0).any() else first)]
         if not sequence.is_complete:
             self.unfinished_sequences.append((self.t, names))
         is_touching = (g <= self.noise) & (u[: len(g)] <= 0.0)
@@ -601,9 +608,9 @@ class Motion:
     def _slip_event(self, balance: Any) -> Any:
         """Return the event at which the friction needed exceeds that available; balance(t, q, v) returns both."""
         needed, available = balance(self.t, self.q, self.v)
-        if abs(needed) > (1.0 + RELEASE_REDUCTION) * available:
+        if abs(needed) > (1.0 + RELEASE_REDUCTION) * available + NEGLIGIBLE_VALUE:
             raise Undetermined(f"friction of {abs(needed):.10g} is needed, but it has {available:.10g}")
-        fully_used = abs(needed) > (1.0 - STICKING_MARGIN) * available
+        fully_used = available > 0.0 and abs(needed) > (1.0 - STICKING_MARGIN) * available
         margin = max(1.0, abs(needed) / available) * (1.0 + STICKING_MARGIN) if fully_used else 1.0
 
         def reserve(t: float, q: Array, v: Array) -> float:
@@ -611,6 +618,12 @@ class Motion:
             return float(margin * available - abs(needed))
 
         return reserve
+
+
+def without_rounding(values: Array, W: Array, speeds: Array, bias: Array | float = 0.0) -> Array:
+    """Return rates, or accelerations, with those that are rounding errors of W v (or W a + bias) set to zero."""
+    terms = np.abs(W).sum(axis=1) * np.abs(speeds).max(initial=0.0) + np.abs(bias)
+    return np.where(np.abs(values) <= ROUNDING * terms, 0.0, values)
 
 
 def make_terminal(event: Any) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from typing import NamedTuple
 
 import numpy as np
@@ -69,13 +70,22 @@ class Impacts:
         For each stop, the smallest rate that is not a rounding error.
     law : str or None
         Law of an impact that several stops share, see `impulses`.
+    deadline : float
+        Time of `time.monotonic()` after which no more impacts are followed.
     """
 
     def __init__(
-        self, D: Array, restitution: Array, tangents: Tangents, noise: float, min_rates: Array, law: str | None
+        self,
+        D: Array,
+        restitution: Array,
+        tangents: Tangents,
+        noise: float,
+        min_rates: Array,
+        law: str | None,
+        deadline: float,
     ):
         self.D, self.restitution, self.tangents, self.law = D, restitution, tangents, law
-        self.noise, self.min_rates, self.n_stops = noise, min_rates, len(restitution)
+        self.noise, self.min_rates, self.n_stops, self.deadline = noise, min_rates, len(restitution), deadline
 
     def joint_impulses(self, stops: NDArray[np.int64], rates: Array, restitution: Array) -> Array:
         """Return the impulses (k + n_tangents,) of one impact that all `stops` share."""
@@ -117,6 +127,8 @@ class Impacts:
             closing = u[:n] < -self.min_rates
             if not closing.any():
                 return Sequence(impact_impulses, drift, elapsed, has_shared_impacts, True)
+            if time.monotonic() > self.deadline:
+                return Sequence(impact_impulses, drift, elapsed, has_shared_impacts, False)
             times = np.full(n, np.inf)
             times[closing] = np.where(g[closing] <= self.noise, 0.0, g[closing] / -u[:n][closing])
             waiting_time = float(times.min())
