@@ -121,9 +121,8 @@ class Collection:
             if not check_text("name", name).strip():
                 raise ValueError(f"name must not be empty; given {name!r}")
             if name in taken:
-                owner = next(part for part in parts if part.name == name)
-                what = "a body" if isinstance(owner, Body) else "another part"
-                raise ValueError(f"name must be unique in the model: {name!r} is already taken by {what}")
+                owner = "a body" if any(body.name == name for body in self.bodies) else "another part"
+                raise ValueError(f"name must be unique in the model: {name!r} is already taken by {owner}")
             return name
         ordered = bodies[::-1] if bodies and bodies[0].number == NONE else bodies
         base = f"{what} {'-'.join(body.name for body in ordered)}" if bodies else what

@@ -22,6 +22,7 @@ MAX_PIVOTS_PER_ROW = 20  # largest number of pivots of Lemke's method, per row
 PIVOT_TOLERANCE = 1e-11  # smallest pivot of Lemke's method, relative to its column
 # largest differences of ratios that count as equal in Lemke's method: rounding may end it if too few or too many do
 TIES = 1e-14, 1e-12, 1e-10
+ROUNDING_ERROR = 1e-13  # largest rounding error of a rate or acceleration, relative to the terms of its sum
 ROUNDED = 2e-14  # largest acceleration or rate that counts as rounding, relative to others that act on it
 SOLVED = 1e-9  # largest violation of a solution, relative to its largest number
 # Lemke's method is repeated along other paths; accelerations that differ by more than PATH_TOLERANCE are not unique
@@ -38,6 +39,12 @@ class Tangents(NamedTuple):
     normal: NDArray[np.int64]
     coefficient: Array
     sign: NDArray[np.int64]
+
+
+def without_rounding(values: Array, W: Array, speeds: Array, bias: Array | float = 0.0) -> Array:
+    """Return rates, or accelerations, with those that are rounding errors of W v (or W a + bias) set to zero."""
+    terms = np.abs(W).sum(axis=1) * np.abs(speeds).max(initial=0.0) + np.abs(bias)
+    return np.where(np.abs(values) <= ROUNDING_ERROR * terms, 0.0, values)
 
 
 def responses(system: ConstrainedSystem, t: float, q: Array, W: Array) -> Array:
@@ -141,8 +148,8 @@ def _forces_in_units(D: Array, c: Array, limit: Array, tangents: Tangents) -> tu
     x[np.abs(x) <= ROUNDED * sizes] = 0.0  # all compliances are about one
     acceleration, terms = D @ x + c, largest(np.abs(D) @ np.abs(x) + np.abs(c))
     for weights in np.random.default_rng(5).uniform(0.5, 2.0, (N_OTHER_PATHS if n > 1 else 0, len(c))):
-        other = _lemke_forces(D, c, limit, tangents, sizes, weights)
-        if other is not None and (np.abs(D @ other + c - acceleration) > PATH_TOLERANCE * terms).any():
+        x_other = _lemke_forces(D, c, limit, tangents, sizes, weights)
+        if x_other is not None and (np.abs(D @ x_other + c - acceleration) > PATH_TOLERANCE * terms).any():
             raise Undetermined(
                 "stops share their loads in any proportion, and with their friction the motion depends on it"
             )

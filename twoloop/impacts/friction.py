@@ -9,7 +9,7 @@ import numpy as np
 
 from twoloop.checks.arguments import Array
 from twoloop.impacts.contact import Gap, Gaps, Undetermined
-from twoloop.impacts.forces import COUPLING_TOLERANCE, Tangents, responses
+from twoloop.impacts.forces import COUPLING_TOLERANCE, Tangents, responses, without_rounding
 from twoloop.problem.description import Stop
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.fallbacks import NEGLIGIBLE_RATIO
@@ -21,7 +21,6 @@ Signs = list[int | None]  # for each joint: its sliding direction (1 or -1), STI
 STICKS, IDLE = 0, None  # states of a joint at rest: STICKS, held by its own friction; IDLE, held by other contacts
 MIN_COMPLIANCE = 1e-9  # smallest ratio of compliances, other joints held / free, of a joint that can slide by itself
 REST_RATE = 1e-10  # largest rate that counts as zero, relative to the largest velocities of the last arc
-ROUNDED_RATE = 1e-13  # largest rounding error of a rate of sliding, relative to the largest velocity
 
 
 class Modes:
@@ -166,9 +165,8 @@ class StopFriction:
         stops = [k for k in closed if k in self.slide_index]
         slides = Gap(*(part[[self.slide_index[k] for k in stops]] for part in self.slides.evaluate(t, q, v)))
         at_rest = np.array([k in self.resting_stops or k in self.released_stops for k in stops], dtype=bool)
-        sizes = np.abs(slides.W)
-        rounding = ROUNDED_RATE * sizes.sum(axis=1) * speeds.max(initial=0.0)
-        is_sliding = ~at_rest & (np.abs(slides.u) > REST_RATE * (sizes @ speeds) + rounding)
+        rates = without_rounding(slides.u, slides.W, speeds)
+        is_sliding = ~at_rest & (np.abs(rates) > REST_RATE * (np.abs(slides.W) @ speeds))
         signs = (np.sign(slides.u) * is_sliding).astype(int)
         normals = np.array([list(closed).index(k) for k in stops], dtype=int)
         return stops, slides, Tangents(normals, np.array([self.coefficient(k) for k in stops]), signs)

@@ -25,7 +25,14 @@ from twoloop.checks.arguments import (
 )
 from twoloop.checks.consistency import is_consistent
 from twoloop.impacts.contact import Accelerations, ContactSystem, Gap, Gaps, Undetermined
-from twoloop.impacts.forces import SLIDING_TOLERANCE, coulomb_forces, holding_forces, impulses, responses
+from twoloop.impacts.forces import (
+    SLIDING_TOLERANCE,
+    coulomb_forces,
+    holding_forces,
+    impulses,
+    responses,
+    without_rounding,
+)
 from twoloop.impacts.friction import (
     IDLE,
     MIN_COMPLIANCE,
@@ -618,12 +625,6 @@ class Motion:
             return float(margin * available - abs(needed))
 
         return reserve
-
-
-def without_rounding(values: Array, W: Array, speeds: Array, bias: Array | float = 0.0) -> Array:
-    """Return rates, or accelerations, with those that are rounding errors of W v (or W a + bias) set to zero."""
-    terms = np.abs(W).sum(axis=1) * np.abs(speeds).max(initial=0.0) + np.abs(bias)
-    return np.where(np.abs(values) <= ROUNDING * terms, 0.0, values)
 
 
 def make_terminal(event: Any) -> Any:

@@ -33,9 +33,8 @@ from twoloop.kernels.data.common import (
 )
 from twoloop.kernels.data.indices import DEFECT_GAP, GAP, MAX_GAP_RATIO, N_COUNTERS
 from twoloop.kernels.evaluation.checks import CONSISTENT, DEFINITE, INDEFINITE, WELL_FORMED
+from twoloop.kernels.evaluation.partition import ROUNDING_ERROR
 from twoloop.kernels.linalg.dense import copy
-
-ROUNDING = 1e-15  # rounding error of a position, relative to max|q|; smaller corrections do not require a new C_q
 
 
 @merged
@@ -58,7 +57,7 @@ def prepare_work(w, numbers, integers, pattern, q, accuracy, reuse):
             w.pattern[i, j] = pattern[i, j]
     rounding_error = 0.0
     for j in range(q.size):
-        rounding_error = max(rounding_error, ROUNDING * abs(q[j]))
+        rounding_error = max(rounding_error, ROUNDING_ERROR * abs(q[j]))
     w.rounded, w.reuse = rounding_error, max(reuse, rounding_error)
     w.gamma_required, w.gamma_step_ratio = accuracy, 1.0
     w.last_jump, w.next_jump = -math.inf, math.inf

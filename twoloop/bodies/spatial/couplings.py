@@ -45,7 +45,8 @@ class GearRow:
 
     def off(self, q: Array) -> float:
         """Return the angle from the tooth in mesh in the position given; zero if more than half a turn from it."""
-        one, other = float(self.one.position(q)), float(_angle(_rotation(q, self.other)))  # NaN about a whole turn
+        one = float(self.one.position(q))  # NaN near a whole turn, which then counts as more than half a turn
+        other = float(_angle(_rotation(q, self.other)))
         meant = one * self.n / self.m
         return other - meant if max(abs(one), abs(meant)) < HALF_TURN else 0.0
 

@@ -406,9 +406,8 @@ AMPLIFICATION = 1e3
 # constraint C_i = 0 holds up to rounding if |C_i| is at most this fraction of its largest term: the largest |G_ij q_j|
 # over the coordinates q_j, with the Jacobian G = C_q
 ROUNDING_OF_ROWS = 2e-15
-# the tolerance of a projection is at least this multiple of the rounding error of positions, ROUNDING_ERROR * max|q|
-MIN_CORRECTION, ROUNDING_ERROR = 10.0, 1e-15
-
+ROUNDING_ERROR = 1e-15  # rounding error of a position, relative to max|q|; smaller corrections need no new C_q
+MIN_CORRECTION = 10.0  # the tolerance of a projection is at least this multiple of the rounding error of positions
 # let g be the largest |entry| of row i of the Jacobian C_q. Constraint i is violated if |C_i| exceeds this number times
 # g max(1, max|q|), or if |(C_q v + C_t)_i| exceeds this number times g max(1, max|v|)
 MAX_VIOLATION = 1e-7
