@@ -15,7 +15,7 @@ from twoloop.kernels.compile.linking import entry_point
 from twoloop.kernels.data import indices
 from twoloop.kernels.data.common import Kit
 from twoloop.kernels.evaluation import tasks
-from twoloop.methods.plan import Plan, crossing_plan
+from twoloop.methods.plan import Plan, crossing_plan, least_tolerance
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.messages import warn_user
 from twoloop.run.run import Run
@@ -297,8 +297,10 @@ def _prepare_next_origin(run: Run, plan: Plan, control: Array) -> None:
     run.crossing_tolerances = run.tolerances.copy()
     if limits.has_wide_gaps:
         run.crossing_tolerances[indices.GAP] *= GAP_FACTOR if any(run.short_forces) else np.inf
-    run.crossing_tolerances[[indices.RTOL, indices.LEAST]] *= limits.tolerance_factor
-    run.crossing_tolerances[indices.ATOL :] *= limits.tolerance_factor
+    # the user's tolerances count here, although the run may have tightened its own, see kernels/control/singular_positions.py
+    factor = limits.tolerance_factor * least_tolerance(run.rtol, run.least_atol) / run.tolerances[indices.LEAST]
+    run.crossing_tolerances[[indices.RTOL, indices.LEAST]] *= factor
+    run.crossing_tolerances[indices.ATOL :] *= factor
     if control[a.FIXED_STEP] == 0.0:
         control[a.MAX_STEP] = min(run.max_step, run.crossing_tolerances[indices.GAP] / control[a.MAX_EVALUATION_GAP])
     h_long, max_size, time_left = float(clock[a.H_LONG]), float(control[a.MAX_STEP]), run.t1 - float(clock[a.T])

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from twoloop.kernels.control.step_size import commit_nothing, prediction_error, store_prediction
 from twoloop.kernels.data.common import ATTEMPT, Attempt, Step, compiled, gap_ratio, inlined, kernel
-from twoloop.kernels.data.indices import ATOL, DONE, ESTIMATE, LEAST, RTOL
+from twoloop.kernels.data.indices import ATOL, DONE, ESTIMATE, RTOL
 from twoloop.kernels.evaluation.inner_loop import evaluate, evaluate_state, evaluate_without_projection, project
 from twoloop.kernels.linalg.dense import copy, sum_rows
 
@@ -24,9 +24,6 @@ STAGES, INNER_TOL, FREE, THETA, N_SCALARS = range(5)
 # of the error of [q, v]. The derivatives [v, a] of the s stages follow. Vectors have 2 n_q numbers and padding
 STAGE_STATE, FINE_ERROR, COARSE_ERROR, N_VECTORS = range(4)
 BLOCK_SIZE = 8  # vectors are padded to a multiple of this size, so that loops over them have no remainder
-# once a run has come near a singular position, where phase errors grow, the error estimates are multiplied by
-# (smallest tolerance) / LEAST_STRICT, but by at least 1 and at most STRICT
-STRICT, LEAST_STRICT = 10.0, 1e-11
 
 
 def options_array(
@@ -160,8 +157,6 @@ def explicit_step(f, w, options, memory, t, h, tolerances, state, new_state):
     error = 0.0
     if tolerances[ESTIMATE] == 1.0:
         error = _estimate_error(tolerances, h, fine, coarse, y, y1, slopes, fine_error, coarse_error, is_near)
-        if is_near:
-            error *= min(max(tolerances[LEAST] / LEAST_STRICT, 1.0), STRICT)
         if not error <= 1.0:
             return Attempt(DONE, error, 0.0)
     store_prediction(w, q1)
