@@ -297,7 +297,7 @@ def _prepare_next_origin(run: Run, plan: Plan, control: Array) -> None:
     run.crossing_tolerances = run.tolerances.copy()
     if limits.has_wide_gaps:
         run.crossing_tolerances[indices.GAP] *= GAP_FACTOR if any(run.short_forces) else np.inf
-    # the user's tolerances count here, although the run may have tightened its own, see kernels/control/singular_positions.py
+    # here the user's tolerances count, even if the run has tightened its own (kernels/control/singular_positions.py)
     factor = limits.tolerance_factor * least_tolerance(run.rtol, run.least_atol) / run.tolerances[indices.LEAST]
     run.crossing_tolerances[[indices.RTOL, indices.LEAST]] *= factor
     run.crossing_tolerances[indices.ATOL :] *= factor
