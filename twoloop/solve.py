@@ -130,9 +130,11 @@ def solve_dae(
     the tolerances of the velocities, unless it has an `error_tol`. With error="richardson-paper" of `RungeKutta`, the
     root mean square counts. The dependent positions are tested, too, except in the paper's two procedures: the distance
     between those that the formula predicts and those that the constraints give counts as an error, and must not exceed
-    about a tenth of the motion in the step. So no step ends on another assembly of the mechanism. As errors of steps
-    around a singular position may grow much, "auto", "Lobatto16", "Taylor", "Adams" and "DOP853" go on with a tenth of
-    the tolerances after the first one that they notice, but not with less than 2e-13 for each coordinate.
+    about a tenth of the motion in the step. So no step ends on another assembly of the mechanism.
+
+    Errors of steps before and after a singular position may grow much. So "auto", "Lobatto16", "Taylor", "Adams" and
+    "DOP853" go on with a tenth of the tolerances once they come near one (but not less than 2e-13 for each coordinate).
+    If this happens in the first third of a run whose states are not in files, the run begins again.
 
     *Output times.* The solution is interpolated between the steps as by `sol`, and the steps do not change. With
     `step_size`, and with the two methods of the paper, steps are shortened to end at the times of `t_eval`.

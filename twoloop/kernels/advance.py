@@ -258,9 +258,7 @@ def advance(
                 n_attempts += n_taken
                 if at_output and _pass_output_time(f, w, clock, outputs, state):
                     return at.ALL_OUTPUT_DONE
-                end_code = check_partition(
-                    f, w, control, clock, tolerances, out_steps[filled[1] - 1, at.H], at_output, state
-                )
+                end_code = check_partition(f, w, control, clock, out_steps[filled[1] - 1, at.H], at_output, state)
                 if end_code != at.CONTINUE:
                     return end_code
                 continue
@@ -379,6 +377,6 @@ def advance(
         if jumps:
             return at.PAUSED
         if control[at.SYMMETRIC] == 0.0:
-            end_code = check_partition(f, w, control, clock, tolerances, size, at_output, state)
+            end_code = check_partition(f, w, control, clock, size, at_output, state)
             if end_code != at.CONTINUE:
                 return end_code

@@ -198,6 +198,27 @@ class Origin(NamedTuple):
 MIN_DISTANCE_RATIO = 0.5
 
 
+# errors of steps before and after a singular position may grow much: once a run comes near one, its tolerances are
+# multiplied by STRICT. None falls below LEAST_STRICT times the number of coordinates, where rounding limits the steps
+STRICT, LEAST_STRICT = 0.1, 2e-13
+
+
+def tighten_tolerances(run: Run) -> bool:
+    """Tighten the tolerances of a run that is near its first singular position; return whether they have changed.
+
+    Runs with steps of fixed size keep theirs, and so do methods that do not look for singular positions.
+    """
+    least = run.tolerances[indices.LEAST]
+    factor = min(max(LEAST_STRICT * run.system.n_q / least, STRICT), 1.0)
+    is_strict = factor == 1.0 or least < least_tolerance(run.rtol, run.least_atol)
+    if is_strict or not run.plan.checks_within or run.control[run.a.FIXED_STEP] > 0.0:
+        return False
+    run.work.notes[indices.NEARLY_SINGULAR] = 1.0
+    run.tolerances[[indices.RTOL, indices.LEAST]] *= factor
+    run.tolerances[indices.ATOL :] *= factor
+    return True
+
+
 def requires_crossing(run: Run, code: int) -> bool:
     """Return whether steps across a singular position must follow after `advance` has returned `code`."""
     a, notes = run.a, run.work.notes
@@ -297,7 +318,7 @@ def _prepare_next_origin(run: Run, plan: Plan, control: Array) -> None:
     run.crossing_tolerances = run.tolerances.copy()
     if limits.has_wide_gaps:
         run.crossing_tolerances[indices.GAP] *= GAP_FACTOR if any(run.short_forces) else np.inf
-    # here the user's tolerances count, even if the run has tightened its own (kernels/control/singular_positions.py)
+    # the user's tolerances count here: a singular position is crossed as well as before `tighten_tolerances`
     factor = limits.tolerance_factor * least_tolerance(run.rtol, run.least_atol) / run.tolerances[indices.LEAST]
     run.crossing_tolerances[[indices.RTOL, indices.LEAST]] *= factor
     run.crossing_tolerances[indices.ATOL :] *= factor

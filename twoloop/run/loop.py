@@ -38,6 +38,7 @@ from twoloop.run.fallbacks import (
     renew_kit,
     requires_crossing,
     switch_method,
+    tighten_tolerances,
     warn_of_missed_changes,
 )
 from twoloop.run.messages import (
@@ -154,6 +155,7 @@ STATUSES_WITH_STIFFNESS_NOTE = {Status.REACHED_END, Status.EVENT, Status.MAX_STE
 N_RECENT, N_LAST_STATES = 16, 256
 MAX_COORDINATES = 100  # with more coordinates, recorded states are not moved onto the polynomial, to save time
 CROSSING_OVERSHOOT = 100.0  # a crossing step may end beyond t1 by at most this multiple of the run's duration
+EARLY = 1.0 / 3.0  # a run begins again with tighter tolerances if it meets a singular position in this part of its time
 NO_KINDS = np.zeros(0, dtype=np.int64)  # kinds of intervals if no states between steps are requested
 # MAX_SPARE: largest number of sets of buffers (times, states, steps of a chunk) kept for later runs. MAX_SPARE_FLOATS:
 # sets whose buffer of states has more floats than this are not kept
@@ -186,10 +188,10 @@ class IntegrationLoop:
         self.request = request = request._replace(ends_at_outputs=ends_at_outputs, store=store)
         self.run, self.t1, self.is_final_attempt = run, t1, is_final_attempt
         run.t1 = t1
-        self.start, self.system = run.state if start is None else start, run.system if system is None else system
+        self.start = (run.state if start is None else start).copy()
+        self.system = run.system if system is None else system
         self.report, self.interrupts = report, interrupts
         self.deadline = np.inf if time_limit is None else time.monotonic() + time_limit
-        self.recorder = self._new_recorder()
         self.outputs = np.array([t1])
         if request.times is not None and request.ends_at_outputs:
             self.outputs = np.append(request.times[(request.times > run.t0) & (request.times < t1)], t1)
@@ -201,19 +203,47 @@ class IntegrationLoop:
         # progress is checked every `check_interval` attempted steps; the next check is due after `next_check` attempts
         self.check_interval = self.next_check = run.chunk
         self.plan, self.control, self.kit = run.plan, run.control, run.kit  # replaced while steps cross a singularity
+        self.n_filled = np.zeros(2, dtype=np.int64)
+        self.may_end_before_t1 = has_terminal_event or time_limit is not None
+        self._begin_records()
+        self.first_counters = run.work.counters * (start is None)  # a caller's first chunk has begun with zeros
+        self.cpu_time = 0.0
+        self.callback_error: Exception | None = None
+        self.code = INTERRUPTED if interrupts.n_signals else run.a.PAUSED
+
+    def _begin_records(self) -> None:
+        """Begin the records of the steps from the start of the run."""
+        run = self.run
+        self.recorder = self._new_recorder()
         self.counts = INITIAL_COUNTS.copy()
         self.latest_chunks: list[tuple[Array, Array]] = []  # times and rows of the last chunks, see _last_states
         self.step_parts = [np.empty((0, run.a.N_STEP_COLUMNS))]  # an empty array, then the steps to be put in `store`
         if self.request.store.append_only:
             self._store_step_fields()
-        self.n_filled = np.zeros(2, dtype=np.int64)
-        may_end_before_t1 = has_terminal_event or time_limit is not None  # then a very large t1 is no sign of stalling
-        self.stall_detector = StallDetector(run.t0, np.inf if may_end_before_t1 else MAX_STEPS_LEFT)
+        # if the run may end before t1, a very large t1 is no sign of stalling
+        self.stall_detector = StallDetector(run.t0, np.inf if self.may_end_before_t1 else MAX_STEPS_LEFT)
         self.stiffness_monitor = StiffnessMonitor(run.plan)
         self.sample = Sample(run.t0, self.start, 2 * run.system.n_q)
-        self.cpu_time = 0.0
-        self.callback_error: Exception | None = None
-        self.code = INTERRUPTED if interrupts.n_signals else run.a.PAUSED
+
+    def _begins_again(self) -> bool:
+        """Begin the run again if it has tightened its tolerances early, as errors of its first steps would grow.
+
+        Return False if the run goes on. `self.code` becomes PAUSED, or RANK_LOST if the run cannot begin again.
+        """
+        run, a, n, steps = self.run, self.run.a, self.run.system.n_q, np.concatenate(self.step_parts)
+        is_early = run.clock[a.T] - run.t0 <= EARLY * (self.t1 - run.t0)
+        if not is_early or len(steps) == 0 or run.starts_singular or self.request.store.append_only:
+            return False
+        code = run.restart(run.t0, self.start[:n], self.start[n : 2 * n])
+        self.code = a.PAUSED if code == indices.DONE else a.RANK_LOST
+        run.jumps, run.clock[a.H_NEXT] = [], steps[0, a.H]
+        run.work.counters[:] = self.first_counters
+        run.work.notes[[indices.NEAR_NOW, indices.LARGEST_DEFECT, indices.UNCHECKED, indices.WIDEST_GAP]] = 0.0
+        run.work.notes[indices.NEXT_JUMP] = self.t1
+        self.request = self.request._replace(store=MemoryStore())
+        self._begin_records()
+        self.next_check = run.chunk
+        return True
 
     def add_first_chunk(self, code: int, t: Array, rows: Array, steps: Array, cpu_time: float) -> None:
         """Record the first chunk, which the caller has taken, and handle the `code` that `advance` returned."""
@@ -223,8 +253,7 @@ class IntegrationLoop:
 
     def integrate_to_end(self, check_derivatives: bool) -> Record:
         """Integrate to the end, check callbacks at states of the run, and return the record of the run."""
-        run, recorder = self.run, self.recorder
-        a, clock = run.a, run.clock
+        run, a, clock = self.run, self.run.a, self.run.clock
         if run.starts_singular and self.code == a.PAUSED:
             self.code = a.NEAR_SINGULAR if run.branch_known else a.ROWS_VIOLATED
             self._choose_method(False, 0)
@@ -243,7 +272,7 @@ class IntegrationLoop:
             self._store_chunk(t, rows, steps, self._interval_kinds(steps, in_crossing, over_jump))
             chunk_time = time.process_time() - began
             self.cpu_time += chunk_time
-            if recorder.end_event is not None:
+            if self.recorder.end_event is not None:
                 break
             self._handle_code(steps, in_crossing, chunk_time)
             if not is_copied or len(buffers[0]) < min(run.chunk, BUFFER_ROWS):
@@ -254,9 +283,9 @@ class IntegrationLoop:
                 _spare_buffers.pop(oldest, None)
         if self.request.between_steps:
             began = time.process_time()
-            recorder.search_intervals()
+            self.recorder.search_intervals()
             self.cpu_time += time.process_time() - began
-        if self.callback_error is not None and recorder.end_event is None:
+        if self.callback_error is not None and self.recorder.end_event is None:
             raise self.callback_error
         return self._build_record(check_derivatives)
 
@@ -357,7 +386,8 @@ class IntegrationLoop:
                 self.code = STAGNATED
         if chunk_time < CHUNK_TIME:
             run.chunk = min(2 * run.chunk, self.largest_chunk)
-        may_continue = self.code in (a.PAUSED, a.NEEDS_COMPILATION, a.NEEDS_DENSE, a.SWITCH_METHOD, a.NEAR_SINGULAR)
+        singular = a.MET_SINGULAR, a.NEAR_SINGULAR
+        may_continue = self.code in (a.PAUSED, a.NEEDS_COMPILATION, a.NEEDS_DENSE, a.SWITCH_METHOD, *singular)
         if may_continue and time.monotonic() > self.deadline:
             self.code = OUT_OF_TIME
         if self.code in (a.PAUSED, a.NEEDS_COMPILATION) and (self.interrupts.n_signals or self.recorder.interrupted):
@@ -369,6 +399,10 @@ class IntegrationLoop:
         if self.code == a.NEEDS_DENSE or run.may_succeed_in_other_form(self.code):
             run.change_form()
             self.plan, self.kit, self.code = run.plan, run.kit, a.PAUSED
+        elif self.code in (a.MET_SINGULAR, a.NEAR_SINGULAR) and tighten_tolerances(run) and self._begins_again():
+            pass
+        elif self.code == a.MET_SINGULAR:
+            self.code = a.PAUSED
         elif requires_crossing(run, self.code):
             self.plan, self.control = cross_singularity(run, self._last_states())
             self.kit = crossing_kit(run.kit)

@@ -22,7 +22,8 @@ from numpy.typing import NDArray
     AT_DISCONTINUITY,  # a constraint rate jumps just after clock[T]: the caller computes the state after the jump
     NEEDS_DENSE,  # the fixed-order form cannot decide which rows are independent: the caller uses a dense form
     NEEDS_COMPILATION,  # the step has no machine code yet: the caller compiles it, then calls `advance` again
-) = range(12)
+    MET_SINGULAR,  # a singular position is near for the first time in the run: the caller tightens the tolerances
+) = range(13)
 SUSPENDED = 0.5  # value of control[MAY_CROSS] after a singular position could not be crossed: ordinary steps go on
 CONTINUE = -1  # value that functions return in place of an end code if the loop goes on
 

@@ -2,7 +2,7 @@
 
 from twoloop.kernels.control import loop_state as at
 from twoloop.kernels.data.common import compiled, merged
-from twoloop.kernels.data.indices import ATOL, AUGMENTED, DONE, FIXED_ORDER, LEAST, NULL_SPACE, RTOL
+from twoloop.kernels.data.indices import AUGMENTED, DONE, FIXED_ORDER, LEAST, NULL_SPACE
 from twoloop.kernels.evaluation.inner_loop import find_tangents, renew_partition
 from twoloop.kernels.evaluation.partition import MAX_ROWS_ELIMINATED, min_pivot_ratio, partition_is_poor, smallest_pivot
 from twoloop.kernels.evaluation.sparse_inner_loop import PROJECT_STAGES
@@ -33,9 +33,6 @@ PASSED_PIVOT_RATIO = 0.6
 # `near_pivot_ratio` returns at least MIN_NEAR_RATIO and at most MAX_NEAR_RATIO. MAX_ROUNDING_ERROR: rounding error, in
 # tolerances, that is allowed near a singular position. EPS: unit roundoff
 MIN_NEAR_RATIO, MAX_NEAR_RATIO, MAX_ROUNDING_ERROR, EPS = 0.02, 0.1, 0.2, 2.0**-53
-# errors of steps around a singular position may grow much. So, once a run has come near one, its tolerances are
-# multiplied by STRICT. None falls below LEAST_STRICT times the number of coordinates, where rounding limits the steps
-STRICT, LEAST_STRICT = 0.1, 2e-13
 MIN_END_RATIO = 0.25  # `ends_near_singular` is True only if the smallest pivot is below this part of clock[PIVOT_HERE]
 
 
@@ -161,24 +158,13 @@ def record_pivot_at_output(f, w, clock, state):
 
 
 @merged
-def _note_singular_position(w, tolerances):
-    """Record that a singular position is near; if it is the first one of the run, tighten `tolerances`, see STRICT."""
-    if w.nearly_singular == 0.0:
-        factor = min(max(LEAST_STRICT * w.Q.size / tolerances[LEAST], STRICT), 1.0)
-        tolerances[RTOL] *= factor
-        tolerances[LEAST] *= factor
-        for k in range(w.Q.size):
-            tolerances[ATOL + k] *= factor
-    w.nearly_singular = w.near_now = 1.0
-
-
-@merged
-def check_partition(f, w, control, clock, tolerances, size, at_output, state):
+def check_partition(f, w, control, clock, size, at_output, state):
     """After a step, choose a new partition if the present one is poor, and check the pivots; return a code.
 
-    Codes: CONTINUE, RANK_LOST (no partition can be chosen) or NEAR_SINGULAR. `size`: size (s) of the step. `at_output`:
-    True if the step ended at an output time, and may be short for this reason alone.
+    Codes: CONTINUE, RANK_LOST (no partition can be chosen), MET_SINGULAR, NEAR_SINGULAR. `size`: size (s) of the step.
+    `at_output`: True if the step ended at an output time, and may be short for this reason alone.
     """
+    met_before = w.nearly_singular != 0.0 or control[at.MAY_CROSS] == 0.0 or control[at.FIXED_STEP] > 0.0
     short = size < SHORT_STEP * clock[at.H_LONG] and control[at.FIXED_STEP] == 0.0 and not at_output
     if f.form == FIXED_ORDER:
         clock[at.PIVOT_HERE] = w.pivot
@@ -204,18 +190,20 @@ def check_partition(f, w, control, clock, tolerances, size, at_output, state):
     clock[at.LARGEST_PIVOT] = max(clock[at.LARGEST_PIVOT], w.pivot)
     w.near_now = 0.0
     if w.pivot < SINGULAR_PIVOT * clock[at.LARGEST_PIVOT]:
-        _note_singular_position(w, tolerances)
+        w.nearly_singular = w.near_now = 1.0
     if size < COLLAPSED_STEP * clock[at.H_LONG] and w.nearly_singular == 0.0 and control[at.MAY_CROSS] == 1.0:
         # w.pivot was computed when the partition was chosen: an old value may hide that a singular position is near
         if renew_partition(f, w, clock[at.T], state[:n]) != DONE:
             return at.RANK_LOST
         w.sensitivity = 1.0  # the least possible value, with which `partition_is_poor` returns True soonest
         if w.pivot < SINGULAR_PIVOT * clock[at.LARGEST_PIVOT]:
-            _note_singular_position(w, tolerances)
+            w.nearly_singular = w.near_now = 1.0
     if short and size < MIN_STEP_NEAR_SINGULAR * clock[at.H_LONG] and w.nearly_singular == 1.0:
         # renew the partition: if it was chosen at a distant state, steps of an implicit method may become too short
         if renew_partition(f, w, clock[at.T], state[:n]) != DONE:
             return at.RANK_LOST
         if control[at.MAY_CROSS] != 1.0 and w.pivot < UNDETERMINED_PIVOT * clock[at.LARGEST_PIVOT]:
             return at.RANK_LOST  # steps across the singular position would be determined by rounding errors
+    if w.nearly_singular == 1.0 and not met_before:
+        return at.MET_SINGULAR
     return at.NEAR_SINGULAR if short and is_near_singular(f, w, control, clock, clock[at.T], state[:n]) else at.CONTINUE
