@@ -206,7 +206,9 @@ class IntegrationLoop:
         self.n_filled = np.zeros(2, dtype=np.int64)
         self.may_end_before_t1 = has_terminal_event or time_limit is not None
         self._begin_records()
-        self.first_counters = run.work.counters * (start is None)  # a caller's first chunk has begun with zeros
+        self.is_whole = (
+            start is not None or run.clock[run.a.T] == run.clock[run.a.T_START]
+        )  # not a part of a sampled run
         self.cpu_time = 0.0
         self.callback_error: Exception | None = None
         self.code = INTERRUPTED if interrupts.n_signals else run.a.PAUSED
@@ -232,12 +234,16 @@ class IntegrationLoop:
         """
         run, a, n, steps = self.run, self.run.a, self.run.system.n_q, np.concatenate(self.step_parts)
         is_early = run.clock[a.T] - run.t0 <= EARLY * (self.t1 - run.t0)
-        if not is_early or len(steps) == 0 or run.starts_singular or self.request.store.append_only:
+        # steps across singular positions that long steps jump over may violate redundant rows
+        is_fixed = run.starts_singular or len(run.redundant) > 0 or self.request.store.append_only
+        if is_fixed or not (is_early and self.is_whole and len(steps)):
             return False
+        run.work.counters[:] = 0
         code = run.restart(run.t0, self.start[:n], self.start[n : 2 * n])
         self.code = a.PAUSED if code == indices.DONE else a.RANK_LOST
-        run.jumps, run.clock[a.H_NEXT] = [], steps[0, a.H]
-        run.work.counters[:] = self.first_counters
+        is_given = run.control[a.FIRST_GIVEN] == 1.0
+        run.clock[a.H_NEXT] = steps[0, a.H] if is_given else run.choose_first_step(run.t0, self.t1, run.state)
+        run.jumps = []
         run.work.notes[[indices.NEAR_NOW, indices.LARGEST_DEFECT, indices.UNCHECKED, indices.WIDEST_GAP]] = 0.0
         run.work.notes[indices.NEXT_JUMP] = self.t1
         self.request = self.request._replace(store=MemoryStore())

@@ -23,7 +23,13 @@ from twoloop.methods.lobatto import Lobatto16
 from twoloop.methods.plan import Method
 from twoloop.methods.taylor import Taylor
 from twoloop.problem.system import ConstrainedSystem
-from twoloop.run.fallbacks import MAX_REPETITIONS, gap_for_repetition, may_have_missed_changes, warn_of_missed_changes
+from twoloop.run.fallbacks import (
+    MAX_REPETITIONS,
+    gap_for_repetition,
+    may_have_missed_changes,
+    tighten_tolerances,
+    warn_of_missed_changes,
+)
 from twoloop.run.loop import IntegrationLoop, Interrupts
 from twoloop.run.messages import warn_of_singular_end, warn_user
 from twoloop.run.record import DEFAULTS, OutputRequest, Status, state_fields, statistics
@@ -193,6 +199,8 @@ class SampledRun:
         run.control[run.a.MAX_ATTEMPTS], clock[a.PIVOT_AT_OUTPUT] = MAX_ATTEMPTS, np.inf
         code = run.advance(self._outputs, self._buffers, self._filled)
         self.steps.append(self._buffers[2][: self._filled[1]].copy())
+        if code == a.MET_SINGULAR:
+            tighten_tolerances(run)
         if code != a.ALL_OUTPUT_DONE:
             self._finish_by_loop(end)
         else:
