@@ -243,7 +243,7 @@ AGAIN = [(5, "bodies", 1e-5), (5, "tips", 1e-9), slow(3, "bodies", 1e-6), slow(1
 
 @pytest.mark.parametrize(("n", "coordinates", "tolerance"), AGAIN)
 def test_a_run_that_meets_a_singular_position_begins_again_with_a_tenth_of_its_tolerances(n, coordinates, tolerance):
-    """Near the upright position errors grow a hundredfold in half a turn: 388, 158, 270 and 319 tolerances else."""
+    """Near the upright position errors grow a hundredfold in half a turn: else 388, 158, 270 and 319 tolerances."""
     problem, times = n_four_bar(n, coordinates), np.linspace(0.0, 20.0, 7)
     own = {"rtol": tolerance, "atol": tolerance}
     with warnings.catch_warnings(action="ignore", category=ConstraintWarning):

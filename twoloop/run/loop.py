@@ -206,9 +206,8 @@ class IntegrationLoop:
         self.n_filled = np.zeros(2, dtype=np.int64)
         self.may_end_before_t1 = has_terminal_event or time_limit is not None
         self._begin_records()
-        self.is_whole = (
-            start is not None or run.clock[run.a.T] == run.clock[run.a.T_START]
-        )  # not a part of a sampled run
+        # False in the middle of a sampled run, which cannot begin again
+        self.is_whole = start is not None or run.work.counters[indices.N_ACCEPTED] == 0
         self.cpu_time = 0.0
         self.callback_error: Exception | None = None
         self.code = INTERRUPTED if interrupts.n_signals else run.a.PAUSED
@@ -235,8 +234,8 @@ class IntegrationLoop:
         run, a, n, steps = self.run, self.run.a, self.run.system.n_q, np.concatenate(self.step_parts)
         is_early = run.clock[a.T] - run.t0 <= EARLY * (self.t1 - run.t0)
         # steps across singular positions that long steps jump over may violate redundant rows
-        is_fixed = run.starts_singular or len(run.redundant) > 0 or self.request.store.append_only
-        if is_fixed or not (is_early and self.is_whole and len(steps)):
+        keeps_steps = run.starts_singular or len(run.redundant) > 0 or self.request.store.append_only
+        if keeps_steps or not (is_early and self.is_whole and len(steps)):
             return False
         run.work.counters[:] = 0
         code = run.restart(run.t0, self.start[:n], self.start[n : 2 * n])
@@ -406,7 +405,7 @@ class IntegrationLoop:
             run.change_form()
             self.plan, self.kit, self.code = run.plan, run.kit, a.PAUSED
         elif self.code in (a.MET_SINGULAR, a.NEAR_SINGULAR) and tighten_tolerances(run) and self._begins_again():
-            pass
+            pass  # `self.code` says how the run goes on
         elif self.code == a.MET_SINGULAR:
             self.code = a.PAUSED
         elif requires_crossing(run, self.code):
