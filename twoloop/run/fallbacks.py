@@ -169,6 +169,10 @@ FAR_BEFORE = 0.2
 # if no step across a singular position succeeds, the tolerances are multiplied by TOLERANCE_FACTOR, and the longest
 # allowed time between evaluations by GAP_FACTOR (if no forces are short, this time becomes unlimited)
 TOLERANCE_FACTOR, GAP_FACTOR = 10.0, 4.0
+# the polynomial's error should be at most GOAL_OF_ERROR tolerances, as errors grow beyond a singular position. If no
+# shorter step, down to LEAST_RATIO times the size, reaches this goal, the best step with at most one tolerance is taken
+GOAL_OF_ERROR, LEAST_RATIO = 0.1, 0.6
+NO_ATTEMPT = np.inf, 0.0  # initial value of `Run.best_attempt`
 MAX_ATTEMPTS_IN_PYTHON = 200  # largest number of failed steps across a singular position if callbacks run in Python
 NODE_DISTANCES = 1.0, 0.5, 0.25  # values that are tried in turn for the field `node_distance` of Limits
 
@@ -200,7 +204,8 @@ MIN_DISTANCE_RATIO = 0.5
 
 # errors of steps before and after a singular position may grow much: once a run comes near one, its tolerances are
 # multiplied by STRICT. None falls below LEAST_STRICT times the number of coordinates, where rounding limits the steps
-STRICT, LEAST_STRICT = 0.1, 2e-13
+STRICT, LEAST_STRICT = 0.02, 1e-14
+ROUNDING_OF_RATIO = 1e-6  # ratios of tolerances that differ by less are equal
 
 
 def tighten_tolerances(run: Run) -> bool:
@@ -208,15 +213,24 @@ def tighten_tolerances(run: Run) -> bool:
 
     Runs with steps of fixed size keep theirs, and so do methods that do not look for singular positions.
     """
-    least = run.tolerances[indices.LEAST]
-    factor = min(max(LEAST_STRICT * run.system.n_q / least, STRICT), 1.0)
-    is_strict = factor == 1.0 or least < least_tolerance(run.rtol, run.least_atol)
+    factor = min(max(LEAST_STRICT * run.system.n_q / run.tolerances[indices.LEAST], STRICT), 1.0)
+    is_strict = factor == 1.0 or _looseness(run) > 1.0
     if is_strict or not run.plan.checks_within or run.control[run.a.FIXED_STEP] > 0.0:
         return False
     run.work.notes[indices.NEARLY_SINGULAR] = 1.0
-    run.tolerances[[indices.RTOL, indices.LEAST]] *= factor
-    run.tolerances[indices.ATOL :] *= factor
+    _scale_tolerances(run.tolerances, factor)
     return True
+
+
+def _looseness(run: Run) -> float:
+    """Return (user's tolerances) / (tolerances of the run): 1, or more after `tighten_tolerances`."""
+    ratio = float(least_tolerance(run.rtol, run.least_atol) / run.tolerances[indices.LEAST])
+    return ratio if ratio > 1.0 + ROUNDING_OF_RATIO else 1.0
+
+
+def _scale_tolerances(tolerances: Array, factor: float) -> None:
+    tolerances[[indices.RTOL, indices.LEAST]] *= factor
+    tolerances[indices.ATOL :] *= factor
 
 
 def requires_crossing(run: Run, code: int) -> bool:
@@ -314,14 +328,14 @@ def _prepare_next_origin(run: Run, plan: Plan, control: Array) -> None:
 
     a, clock = run.a, run.clock
     earliest, base, limits, beyond = run.origins.pop(0)
-    begin_polynomial(plan.memory, clock[a.LARGEST_PIVOT], earliest, limits.may_approach, limits.node_distance, base)
+    distances = limits.may_approach, limits.node_distance
+    begin_polynomial(plan.memory, clock[a.LARGEST_PIVOT], earliest, *distances, base, GOAL_OF_ERROR)
+    run.best_attempt = NO_ATTEMPT
     run.crossing_tolerances = run.tolerances.copy()
     if limits.has_wide_gaps:
         run.crossing_tolerances[indices.GAP] *= GAP_FACTOR if any(run.short_forces) else np.inf
     # the user's tolerances count here: a singular position is crossed as well as before `tighten_tolerances`
-    factor = limits.tolerance_factor * least_tolerance(run.rtol, run.least_atol) / run.tolerances[indices.LEAST]
-    run.crossing_tolerances[[indices.RTOL, indices.LEAST]] *= factor
-    run.crossing_tolerances[indices.ATOL :] *= factor
+    _scale_tolerances(run.crossing_tolerances, limits.tolerance_factor * _looseness(run))
     if control[a.FIXED_STEP] == 0.0:
         control[a.MAX_STEP] = min(run.max_step, run.crossing_tolerances[indices.GAP] / control[a.MAX_EVALUATION_GAP])
     h_long, max_size, time_left = float(clock[a.H_LONG]), float(control[a.MAX_STEP]), run.t1 - float(clock[a.T])
@@ -425,6 +439,14 @@ def handle_crossing(run: Run, plan: Plan, control: Array, code: int, n_accepted:
             run.sizes_to_try, run.origins = [], []
         if clock[a.FAILURE_CODE] not in (indices.SINGULAR, indices.OUTER_DIVERGED):
             run.sizes_to_try = [size for size in run.sizes_to_try if size < run.crossing_size]
+        error = float(stored[kernels.ERROR])
+        is_worse = run.best_attempt[0] <= error < np.inf
+        if GOAL_OF_ERROR < error <= 1.0 and not is_worse and stored[kernels.MAX_ERROR] < 1.0:
+            run.best_attempt = error, run.crossing_size
+        best = run.best_attempt[1]
+        if best > 0.0 and (is_worse or run.crossing_size < LEAST_RATIO * best or not run.sizes_to_try):
+            run.sizes_to_try.insert(0, best)
+            stored[kernels.MAX_ERROR], run.best_attempt = 1.0, NO_ATTEMPT
         if run.sizes_to_try:
             clock[a.H_NEXT], clock[a.H_LIMIT] = run.sizes_to_try.pop(0), np.inf
             run.crossing_size = float(clock[a.H_NEXT])

@@ -155,7 +155,9 @@ STATUSES_WITH_STIFFNESS_NOTE = {Status.REACHED_END, Status.EVENT, Status.MAX_STE
 N_RECENT, N_LAST_STATES = 16, 256
 MAX_COORDINATES = 100  # with more coordinates, recorded states are not moved onto the polynomial, to save time
 CROSSING_OVERSHOOT = 100.0  # a crossing step may end beyond t1 by at most this multiple of the run's duration
-EARLY = 1.0 / 3.0  # a run begins again with tighter tolerances if it meets a singular position in this part of its time
+# a run begins again with tighter tolerances if it meets its first singular position in the part EARLY of its time, or
+# after at most FEW_STEPS steps: loose tolerances jump over the first positions unnoticed
+EARLY, FEW_STEPS = 1.0 / 3.0, 32
 NO_KINDS = np.zeros(0, dtype=np.int64)  # kinds of intervals if no states between steps are requested
 # MAX_SPARE: largest number of sets of buffers (times, states, steps of a chunk) kept for later runs. MAX_SPARE_FLOATS:
 # sets whose buffer of states has more floats than this are not kept
@@ -232,7 +234,7 @@ class IntegrationLoop:
         Return False if the run goes on. `self.code` becomes PAUSED, or RANK_LOST if the run cannot begin again.
         """
         run, a, n, steps = self.run, self.run.a, self.run.system.n_q, np.concatenate(self.step_parts)
-        is_early = run.clock[a.T] - run.t0 <= EARLY * (self.t1 - run.t0)
+        is_early = run.clock[a.T] - run.t0 <= EARLY * (self.t1 - run.t0) or len(steps) <= FEW_STEPS
         # steps across singular positions that long steps jump over may violate redundant rows
         keeps_steps = run.starts_singular or len(run.redundant) > 0 or self.request.store.append_only
         if keeps_steps or not (is_early and self.is_whole and len(steps)):

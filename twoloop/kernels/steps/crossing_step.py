@@ -9,7 +9,8 @@ motion, and the fixed-point iteration converges as it does elsewhere.
   velocities and eps/s^3 in accelerations (eps: machine epsilon). Nodes with too large rounding errors are left out:
   their accelerations are interpolated from nodes on both sides, because the motion through the position is analytic.
 - The result depends on q and v at the beginning only: the accelerations there may consist of rounding errors.
-- The end of the step is projected onto the constraints with a partition chosen there.
+- The end of the step is projected onto the constraints by corrections of least energy, then with a partition chosen
+  there.
 - The generated code of the mechanism projects the stages. If there is no generated code, or if its pivots are too
   small, the general code projects them, with a partition chosen at the stage.
 - The step is rejected if the projection changes a stage by more than two tolerances: the stage is on another branch of
@@ -32,15 +33,17 @@ INNER_TOL, THETA, N_SCALARS = range(3)
 S = 20  # number of Gauss nodes, which are the stages
 CONVERGED_CHANGE = 0.01  # the iteration has converged if a sweep changes accelerations by at most this (in tolerances)
 # the iteration has also converged if a sweep changes accelerations by at most STALL_CHANGE tolerances, and by at least
-# STALL_RATIO times the change by the sweep before: rounding errors then keep the change from decreasing
-STALL_RATIO, STALL_CHANGE = 0.5, 0.3
+# STALL_RATIO times the change by the sweep before: rounding errors then keep the change from decreasing. If the change
+# increases, it may be as large as MAX_NOISE
+STALL_RATIO, STALL_CHANGE, MAX_NOISE = 0.5, 0.3, 2.0
 MAX_SWEEPS, FEW_SWEEPS = 40, 12  # a step fails after MAX_SWEEPS; after FEW_SWEEPS, it leaves out more nodes than before
 DISTANCE_FACTOR = 2.0  # after FEW_SWEEPS sweeps, the pivot below which nodes are left out is multiplied by this
 MAX_LEFT_OUT_NODES = 9  # a step fails if more nodes than this are left out
 # indices of the scalars at the end of `memory`. LARGEST_PIVOT to NODE_DISTANCE store arguments of `begin_polynomial`,
-# and BASE the time (s) of its argument `base`. BEGIN, DURATION and END store the beginning, duration and end (s) of the
-# polynomial that the last converged attempt computed; if there is none, END contains -inf
-LARGEST_PIVOT, EARLIEST, MAY_APPROACH, NODE_DISTANCE, BASE, BEGIN, DURATION, END, N_STORED = range(9)
+# and BASE the time (s) of its argument `base`. An attempt succeeds if its error, in tolerances, is at most MAX_ERROR. It
+# stores the error in ERROR (inf: the iteration did not converge). BEGIN, DURATION and END: beginning, duration and end
+# (s) of the polynomial that the last successful attempt computed; if there is none, END contains -inf
+LARGEST_PIVOT, EARLIEST, MAY_APPROACH, NODE_DISTANCE, BASE, MAX_ERROR, ERROR, BEGIN, DURATION, END, N_STORED = range(11)
 SHORTEST_PIECE, LONGEST_PIECE = 0.05, 0.2  # limits of (size of a piece) / (duration of polynomial), see `piece_ends`
 NODE_GAP = 0.0767  # longest time between two successive nodes, relative to the duration of the polynomial
 BACKWARD_FRACTION = 0.4  # largest fraction of a polynomial's duration that may lie before the step
@@ -69,18 +72,19 @@ def memory_size(n):
     return (S + 7) * n + 3 * S + N_STORED
 
 
-def begin_polynomial(memory, largest_pivot, earliest, may_approach, node_distance=1.0, base=None):
+def begin_polynomial(memory, largest_pivot, earliest, may_approach, node_distance=1.0, base=None, max_error=1.0):
     """Discard the polynomial in `memory`, and store the conditions that the next one must satisfy.
 
     `largest_pivot` is the largest pivot of the run so far; no node may lie before the time `earliest` (s). If
     `may_approach`, the polynomial need not cross the singular position, but may end before it. The pivot below which
     nodes are left out is multiplied by `node_distance`. The polynomial goes through `base`, the time (s) and state
-    [q, v, ...] of an earlier step; if `base` is None, it goes through the state at the beginning of the step.
+    [q, v, ...] of an earlier step; if `base` is None, it goes through the state at the beginning of the step. Its error
+    must be at most `max_error` tolerances.
     """
     stored = memory[-N_STORED:]
     stored[:] = np.nan
     stored[LARGEST_PIVOT], stored[EARLIEST], stored[MAY_APPROACH] = largest_pivot, earliest, may_approach
-    stored[NODE_DISTANCE], stored[END] = node_distance, -np.inf
+    stored[NODE_DISTANCE], stored[MAX_ERROR], stored[END] = node_distance, max_error, -np.inf
     if base is not None:
         n = (memory.size - 3 * S - N_STORED) // (S + 7)
         stored[BASE], memory[(S + 5) * n : (S + 7) * n] = base[0], base[1][: 2 * n]
@@ -254,6 +258,10 @@ def _finish_piece(f, w, t, min_node_pivot, options, tolerances, stage, state, ne
     if code == DONE:
         store_prediction(w, q1)
         w.orientation_new = w.orientation
+        # polynomials conserve energy well, but leave the constraints along weak directions. Corrections of least energy
+        # keep this energy; corrections of dependent coordinates alone would change it by the amount of the violation
+        code = project(f, w, t, q1, v1, options[THETA], a1, lam1)
+    if code == DONE:
         code = evaluate_state(f, w, t, q1, v1, options[INNER_TOL], a1, lam1)
     if min_node_pivot > 0.0 and not (is_determined and code == DONE):
         if code != DONE:
@@ -305,7 +313,7 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
         begin, duration = stored[BEGIN], stored[DURATION]
         _polynomial_at(t + h - begin, duration, b, c, a, q_0, v_0, weights_v, weights_q, q_stage, v_stage, a_stage)
         return _finish_piece(f, w, t + h, min_node_pivot * largest_pivot, options, tolerances, stage, state, new_state)
-    stored[END] = -np.inf
+    stored[ERROR], stored[END] = np.inf, -np.inf
     if time_of_base <= t:
         duration, t_base = t + h - time_of_base, time_of_base
     else:
@@ -395,9 +403,12 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
             for j in range(S):
                 if kept[j] < 0.0:
                     _interpolate(c[j], c, kept, a, a[j])
-        elif change <= CONVERGED_CHANGE or (sweep > 3 and STALL_RATIO * previous_change <= change <= STALL_CHANGE):
-            has_converged = True
-            break
+        else:
+            may_stall = STALL_CHANGE if change < previous_change else MAX_NOISE
+            has_stalled = sweep > 3 and STALL_RATIO * previous_change <= change <= may_stall
+            if change <= CONVERGED_CHANGE or has_stalled:
+                has_converged = True
+                break
         _set_beginning_state(duration, c_base, weights_v, weights_q, a, q_base, v_base, q_0, v_0)
         # already after two sweeps, test the pivot at the end: q is accurate enough, and this test finds most failures
         if sweep == 1 and is_estimated:
@@ -411,8 +422,10 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
     error = 0.0
     if is_estimated:
         error = max(_estimate_error(tolerances, h, state, legendre, a, n_kept), PROJECTION_WEIGHT * largest_move)
-        if not error <= 1.0:
-            return Attempt(DONE, error, 0.0)
+        error = max(error, b[S // 2] * change)  # rounding errors of the accelerations at one node
+        stored[ERROR] = error
+        if not error <= stored[MAX_ERROR]:
+            return Attempt(DONE, max(error, REPEAT_FACTOR), 0.0)
     _set_beginning_state(duration, c_base, weights_v, weights_q, a, q_base, v_base, q_0, v_0)
     min_pivots = MIN_PIVOT_RATIO * pivot, min_node_pivot * largest_pivot
     code = _choose_partition_at_end(f, w, t + h, duration, stored, *min_pivots, tables, a, *states)
