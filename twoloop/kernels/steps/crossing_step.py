@@ -40,9 +40,9 @@ MAX_SWEEPS, FEW_SWEEPS = 40, 12  # a step fails after MAX_SWEEPS; after FEW_SWEE
 DISTANCE_FACTOR = 2.0  # after FEW_SWEEPS sweeps, the pivot below which nodes are left out is multiplied by this
 MAX_LEFT_OUT_NODES = 9  # a step fails if more nodes than this are left out
 # indices of the scalars at the end of `memory`. LARGEST_PIVOT to NODE_DISTANCE store arguments of `begin_polynomial`,
-# and BASE the time (s) of its argument `base`. An attempt succeeds if its error, in tolerances, is at most MAX_ERROR. It
-# stores the error in ERROR (inf: the iteration did not converge). BEGIN, DURATION and END: beginning, duration and end
-# (s) of the polynomial that the last successful attempt computed; if there is none, END contains -inf
+# and BASE the time (s) of its argument `base`. An attempt succeeds if its error, in tolerances, is at most MAX_ERROR;
+# ERROR stores the error (inf: the iteration did not converge). BEGIN, DURATION and END: beginning, duration and end (s)
+# of the polynomial that the last successful attempt computed; if there is none, END contains -inf
 LARGEST_PIVOT, EARLIEST, MAY_APPROACH, NODE_DISTANCE, BASE, MAX_ERROR, ERROR, BEGIN, DURATION, END, N_STORED = range(11)
 SHORTEST_PIECE, LONGEST_PIECE = 0.05, 0.2  # limits of (size of a piece) / (duration of polynomial), see `piece_ends`
 NODE_GAP = 0.0767  # longest time between two successive nodes, relative to the duration of the polynomial
