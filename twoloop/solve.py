@@ -135,7 +135,7 @@ def solve_dae(
     Errors of steps before and after a singular position may grow much. So "auto", "Lobatto16", "Taylor", "Adams" and
     "DOP853" go on with 2 % of the tolerances once they come near one (but not less than 1e-14 for each coordinate). If
     this happens in the first third of a run or in its first 32 steps, the run begins again, unless its states are in
-    files or rows are redundant.
+    files, rows are redundant, or it began beside a singular position.
 
     *Output times.* The solution is interpolated between the steps as by `sol`, and the steps do not change. With
     `step_size`, and with the two methods of the paper, steps are shortened to end at the times of `t_eval`.

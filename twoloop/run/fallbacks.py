@@ -229,6 +229,7 @@ def _looseness(run: Run) -> float:
 
 
 def _scale_tolerances(tolerances: Array, factor: float) -> None:
+    """Multiply the relative, absolute and least tolerance in the array `tolerances` by `factor`."""
     tolerances[[indices.RTOL, indices.LEAST]] *= factor
     tolerances[indices.ATOL :] *= factor
 
@@ -328,8 +329,8 @@ def _prepare_next_origin(run: Run, plan: Plan, control: Array) -> None:
 
     a, clock = run.a, run.clock
     earliest, base, limits, beyond = run.origins.pop(0)
-    distances = limits.may_approach, limits.node_distance
-    begin_polynomial(plan.memory, clock[a.LARGEST_PIVOT], earliest, *distances, base, GOAL_OF_ERROR)
+    conditions = earliest, limits.may_approach, limits.node_distance, base, GOAL_OF_ERROR
+    begin_polynomial(plan.memory, clock[a.LARGEST_PIVOT], *conditions)
     run.best_attempt = NO_ATTEMPT
     run.crossing_tolerances = run.tolerances.copy()
     if limits.has_wide_gaps:
@@ -349,6 +350,17 @@ def _prepare_next_origin(run: Run, plan: Plan, control: Array) -> None:
     run.crossing_size = float(clock[a.H_NEXT])
 
 
+def distance_from_singular(run: Run, t: float, q: Array) -> float:
+    """Choose the partition at q; return (smallest pivot of C_q there) / (its largest value in the run)."""
+    arguments = (0.0, run.work.x, run.work.lam)
+    code = entry_point(run.kit.inner)(run.kit, run.work, tasks.RENEW_PARTITION, t, q, q, *arguments)
+    if code != indices.DONE:
+        return 0.0
+    clock, pivot = run.clock, float(run.work.notes[indices.PIVOT])
+    clock[run.a.LARGEST_PIVOT] = max(clock[run.a.LARGEST_PIVOT], pivot)
+    return pivot / float(clock[run.a.LARGEST_PIVOT])
+
+
 def _find_base_state(run: Run, past: list[TimedState]) -> tuple[TimedState | None, float]:
     """Return where a polynomial across a singular position begins (None: at the current state), and a step size (s).
 
@@ -358,20 +370,11 @@ def _find_base_state(run: Run, past: list[TimedState]) -> tuple[TimedState | Non
     """
     a, clock, t, n = run.a, run.clock, float(run.clock[run.a.T]), run.system.n_q
 
-    def distance_of(time: float, state: Array) -> float:
-        q, arguments = state[:n], (0.0, run.work.x, run.work.lam)
-        code = entry_point(run.kit.inner)(run.kit, run.work, tasks.RENEW_PARTITION, time, q, q, *arguments)
-        if code != indices.DONE:
-            return 0.0
-        pivot = float(run.work.notes[indices.PIVOT])
-        clock[a.LARGEST_PIVOT] = max(clock[a.LARGEST_PIVOT], pivot)
-        return pivot / float(clock[a.LARGEST_PIVOT])
-
-    farthest = distance_now = distance_of(t, run.state)
+    farthest = distance_now = distance_from_singular(run, t, run.state[:n])
     base: TimedState | None = None
     size = 0.0
     for time, state in reversed(past):
-        distance = distance_of(time, state)
+        distance = distance_from_singular(run, time, state[:n])
         if (farthest >= FAR_BEFORE and size > 0.0) or distance < MIN_DISTANCE_RATIO * farthest:
             break
         if distance > farthest:

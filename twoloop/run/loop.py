@@ -31,9 +31,11 @@ from twoloop.problem.events import SAMPLES
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.dense_solution import interpolator_of
 from twoloop.run.fallbacks import (
+    FAR_BEFORE,
     apply_jump,
     cross_singularity,
     crossing_kit,
+    distance_from_singular,
     handle_crossing,
     renew_kit,
     requires_crossing,
@@ -158,6 +160,9 @@ CROSSING_OVERSHOOT = 100.0  # a crossing step may end beyond t1 by at most this 
 # a run begins again with tighter tolerances if it meets its first singular position in the part EARLY of its time, or
 # after at most FEW_STEPS steps: loose tolerances jump over the first positions unnoticed
 EARLY, FEW_STEPS = 1.0 / 3.0, 32
+# a run that meets a singular position in this part of its time began beside it, and keeps its tolerances up to the next
+# one: rounding errors exceed tighter ones there, and a crossing has no room for its polynomial before the position
+BESIDE_START = 0.01
 NO_KINDS = np.zeros(0, dtype=np.int64)  # kinds of intervals if no states between steps are requested
 # MAX_SPARE: largest number of sets of buffers (times, states, steps of a chunk) kept for later runs. MAX_SPARE_FLOATS:
 # sets whose buffer of states has more floats than this are not kept
@@ -238,6 +243,12 @@ class IntegrationLoop:
         # steps across singular positions that long steps jump over may violate redundant rows
         keeps_steps = run.starts_singular or len(run.redundant) > 0 or self.request.store.append_only
         if keeps_steps or not (is_early and self.is_whole and len(steps)):
+            return False
+        for t, state in self._last_states():
+            distance_from_singular(run, t, state[:n])  # record the largest pivot, which generated code does not
+        if distance_from_singular(run, run.t0, self.start[:n]) < FAR_BEFORE:
+            # the run begins beside a singular position, and has passed it: a crossing would need states before it
+            distance_from_singular(run, float(run.clock[a.T]), run.state[:n])  # return to the present partition
             return False
         run.work.counters[:] = 0
         code = run.restart(run.t0, self.start[:n], self.start[n : 2 * n])
@@ -406,7 +417,7 @@ class IntegrationLoop:
         if self.code == a.NEEDS_DENSE or run.may_succeed_in_other_form(self.code):
             run.change_form()
             self.plan, self.kit, self.code = run.plan, run.kit, a.PAUSED
-        elif self.code in (a.MET_SINGULAR, a.NEAR_SINGULAR) and tighten_tolerances(run) and self._begins_again():
+        elif self._must_tighten() and tighten_tolerances(run) and self._begins_again():
             pass  # `self.code` says how the run goes on
         elif self.code == a.MET_SINGULAR:
             self.code = a.PAUSED
@@ -434,6 +445,12 @@ class IntegrationLoop:
                 self._correct_last_states()
             if self.plan is run.plan:
                 self.kit = run.kit
+
+    def _must_tighten(self) -> bool:
+        """Return whether the run has come near a singular position beside which it did not begin."""
+        a, clock = self.run.a, self.run.clock
+        is_beside_start = clock[a.T] - self.run.t0 < BESIDE_START * (self.t1 - self.run.t0)
+        return self.code in (a.MET_SINGULAR, a.NEAR_SINGULAR) and not is_beside_start
 
     def _last_states(self) -> list[TimedState]:
         """Return states at which the polynomial across a singular position may begin; [] if none are recorded."""

@@ -121,10 +121,8 @@ class Run:
         self.sizes_to_try: list[float] = []  # step sizes (s) still to be tried across a singular position
         self.attempts_left = np.inf  # the search for a step across a singular position ends after so many failures
         self.crossing_size = 0.0  # size (s) of the last attempted step across a singular position
-        self.best_attempt = (
-            np.inf,
-            0.0,
-        )  # least error (in tolerances, at most 1) of these steps, and size (s) of the step
+        # error (in tolerances, at most 1; inf: none) and size (s) of the most accurate of these steps so far
+        self.best_attempt = np.inf, 0.0
         self.piece_ends: list[float] = []  # end times (s) of steps still to be taken along a crossing's polynomial
         self.origins: list[Any] = []  # the `Origin` of each polynomial that is still to be tried for a crossing
         self.t1 = np.inf  # end of the run (s)

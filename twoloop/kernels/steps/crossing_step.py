@@ -33,8 +33,8 @@ INNER_TOL, THETA, N_SCALARS = range(3)
 S = 20  # number of Gauss nodes, which are the stages
 CONVERGED_CHANGE = 0.01  # the iteration has converged if a sweep changes accelerations by at most this (in tolerances)
 # the iteration has also converged if a sweep changes accelerations by at most STALL_CHANGE tolerances, and by at least
-# STALL_RATIO times the change by the sweep before: rounding errors then keep the change from decreasing. If the change
-# increases, it may be as large as MAX_NOISE
+# STALL_RATIO times the change by the sweep before: rounding errors then keep the change from decreasing. A change that
+# increases is certainly noise. It may reach MAX_NOISE, because the end of the step averages the noise over all nodes
 STALL_RATIO, STALL_CHANGE, MAX_NOISE = 0.5, 0.3, 2.0
 MAX_SWEEPS, FEW_SWEEPS = 40, 12  # a step fails after MAX_SWEEPS; after FEW_SWEEPS, it leaves out more nodes than before
 DISTANCE_FACTOR = 2.0  # after FEW_SWEEPS sweeps, the pivot below which nodes are left out is multiplied by this
