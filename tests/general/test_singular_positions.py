@@ -75,15 +75,16 @@ def test_a_rhombus_turns_through_its_singular_positions_as_its_two_angles_do(y0,
     assert not result.certify().faults
 
 
-@pytest.mark.parametrize(
-    ("method", "step_size"), [("DOP853", 0.0173), slow("SunRadau5", 0.01), slow("RadauIIA5", 0.0173)]
-)
-def test_one_window_by_steps_of_constant_size(method, step_size):
-    """Steps of more than the width of the singular position; only the branch is asked for."""
-    m = mechanism("A02, N = 1")
-    result = solve_dae(m.system(), (0.0, 173 * step_size), *m.start, method=method, step_size=step_size)
+STEPS = [("Taylor", 0.01), ("Taylor", 0.0025), ("Lobatto16", 0.01), slow("Gauss8", 0.005), slow("DOP853", 0.0173)]
+
+
+@pytest.mark.parametrize(("method", "step_size"), [*STEPS, slow("SunRadau5", 0.01), slow("RadauIIA5", 0.01)])
+def test_steps_of_constant_size_across_singular_positions(method, step_size):
+    """Taylor series about states beside these positions diverged, but were used: an error of 0.9, with success."""
+    m, end = mechanism("A02, N = 1"), 3.0
+    result = solve_dae(m.system(), (0.0, end), *m.start, method=method, step_size=step_size)
     assert result.success, result.message
-    assert np.abs(result.q[2:] - result.q[:2] - [[1.0], [0.0]]).max() < 1e-3  # on the other branch the coupler turns
+    assert worst(result.q[:, -1], m.state(end)[0]) < (1e-4 if "Radau" in method else 1e-7)
 
 
 @pytest.mark.parametrize(

@@ -345,7 +345,7 @@ def _prepare_next_origin(run: Run, plan: Plan, control: Array) -> None:
         max_size = min(max_size, time_left)
     first_size = max(h_long, run.mirrored_size)
     sizes = sizes_across(first_size, max_size, _is_near_start(run))
-    run.sizes_to_try = [size for size in sizes if size > min_size] or sizes[:1]
+    run.sizes_to_try = [size for size in sizes if size > min_size and control[a.FIXED_STEP] == 0.0] or sizes[:1]
     clock[a.H_NEXT], clock[a.H_LIMIT] = run.sizes_to_try.pop(0), np.inf
     run.crossing_size = float(clock[a.H_NEXT])
 

@@ -214,7 +214,7 @@ NEAR_END = 1e-3  # a message mentions that the end is near if at most this fract
 
 _FAILURE_REASONS = {
     indices.DONE: "the error estimate stayed above the tolerances",
-    indices.OUTER_DIVERGED: "the outer loop (stages) did not converge",
+    indices.OUTER_DIVERGED: "the outer loop (stages) or the Taylor series did not converge",
     indices.INNER_DIVERGED: "the inner loop (Newton on the positions) did not converge",
     indices.SINGULAR: "the dependent columns of the constraint Jacobian became singular",
     indices.MASS_NOT_DEFINITE: "the mass matrix was not positive definite",

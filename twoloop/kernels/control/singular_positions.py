@@ -41,11 +41,12 @@ def is_near_singular(f, w, control, clock, t, q):
     """Return True if a singular position is near the accepted position q at time t, and control[MAY_CROSS] is 1.
 
     A singular position is near if the smallest pivot of C_q is small, or if no partition can be chosen. Compute this
-    pivot for a new partition if its last value, w.pivot, is small or may be old, as generated code took the last steps.
+    pivot for a new partition if its last value, w.pivot, is small or may be old: generated code took the last steps, or
+    steps have a fixed size.
     """
     if control[at.MAY_CROSS] != 1.0:
         return False
-    is_old = f.is_generated == 1 and w.nearly_singular == 1.0
+    is_old = control[at.FIXED_STEP] > 0.0 or (f.is_generated == 1 and w.nearly_singular == 1.0)
     if not is_old and w.pivot >= SINGULAR_PIVOT * clock[at.LARGEST_PIVOT]:
         return False
     return renew_partition(f, w, t, q) != DONE or w.pivot < SINGULAR_PIVOT * clock[at.LARGEST_PIVOT]

@@ -36,6 +36,8 @@ CONVERGED_CHANGE = 0.01  # the iteration has converged if a sweep changes accele
 # STALL_RATIO times the change by the sweep before: rounding errors then keep the change from decreasing. A change that
 # increases is certainly noise. It may reach MAX_NOISE, because the end of the step averages the noise over all nodes
 STALL_RATIO, STALL_CHANGE, MAX_NOISE = 0.5, 0.3, 2.0
+# a step of fixed size fails if its last sweep changes velocities by more than this times ROUNDING, relative to 1 + |v|
+MAX_FIXED_CHANGE = 1e11
 MAX_SWEEPS, FEW_SWEEPS = 40, 12  # a step fails after MAX_SWEEPS; after FEW_SWEEPS, it leaves out more nodes than before
 DISTANCE_FACTOR = 2.0  # after FEW_SWEEPS sweeps, the pivot below which nodes are left out is multiplied by this
 MAX_LEFT_OUT_NODES = 9  # a step fails if more nodes than this are left out
@@ -417,7 +419,7 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
             if code != DONE:
                 return Attempt(code, np.inf, 0.0)
         previous_change = change
-    if not has_converged and is_estimated:
+    if not (has_converged if is_estimated else max(change, largest_move) <= MAX_FIXED_CHANGE):
         return Attempt(OUTER_DIVERGED, np.inf, 0.0)
     error = 0.0
     if is_estimated:
@@ -427,7 +429,8 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
         if not error <= stored[MAX_ERROR]:
             return Attempt(DONE, max(error, REPEAT_FACTOR), 0.0)
     _set_beginning_state(duration, c_base, weights_v, weights_q, a, q_base, v_base, q_0, v_0)
-    min_pivots = MIN_PIVOT_RATIO * pivot, min_node_pivot * largest_pivot
+    # a step of fixed size ends where it must, even if this is nearer to the singular position than its beginning
+    min_pivots = MIN_PIVOT_RATIO * pivot if is_estimated else 0.0, min_node_pivot * largest_pivot
     code = _choose_partition_at_end(f, w, t + h, duration, stored, *min_pivots, tables, a, *states)
     if code != DONE:
         return Attempt(code, np.inf, 0.0)

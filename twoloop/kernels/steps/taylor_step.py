@@ -32,7 +32,7 @@ from twoloop.kernels.data.common import (
     kernel,
     merged,
 )
-from twoloop.kernels.data.indices import ATOL, DEFECT_GAP, DONE, ESTIMATE, FIXED_ORDER, NOT_FINITE, RTOL
+from twoloop.kernels.data.indices import ATOL, DEFECT_GAP, DONE, ESTIMATE, FIXED_ORDER, NOT_FINITE, OUTER_DIVERGED, RTOL
 from twoloop.kernels.evaluation import operations as op
 from twoloop.kernels.evaluation.inner_loop import evaluate_without_projection, project
 from twoloop.kernels.evaluation.tasks import EVALUATE_WITHOUT_PROJECTION, SOLVE
@@ -393,6 +393,8 @@ NEAR_BEGIN = 1e-5  # time from the beginning of a step to a state where the seri
 GOLDEN_SECTION = 0.6180339887498949
 MAX_DEFECT = 1e300  # replaces an infinite defect, which means that a callback had no finite value: the step is rejected
 MIN_FACTOR = 0.1  # smallest ratio of the next step size to the size of a step rejected because of its defect
+# a step of fixed size fails if the last term of the velocities' series is above this fraction of the first two terms
+MAX_LAST_TERM = 0.01
 MAX_GROWTH = 5.0  # largest ratio of successive step sizes, because coefficients are scaled by the previous step size
 MAX_FIRST_FACTOR = 1e6  # largest ratio of the first step size to its guess, so that powers of the ratio do not overflow
 TOO_SHORT = 2.0  # error returned for a first step much shorter than its series allows; above 1, so that it is repeated
@@ -428,6 +430,16 @@ def _max_step(tolerances, series, unit, order, n):
     if before > 0.0:
         log_inverse = max(log_inverse, np.log(before) / (order - 1))
     return np.exp(-log_inverse)
+
+
+@compiled
+def _diverges(series, order, n, x):
+    """Return True if the last term of the velocities after x units is above MAX_LAST_TERM of the first two terms."""
+    first, last = 0.0, 0.0
+    for j in range(n):
+        first = max(first, abs(series[n + j]), abs(2.0 * x * series[2 * n + j]))
+        last = max(last, abs(series[order * n + j]))
+    return not order * x ** (order - 1) * last <= MAX_LAST_TERM * first
 
 
 @merged
@@ -568,6 +580,8 @@ def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
             defect = _first_large_defect(f, w, memory, t, h, tolerances, series, order, q1, v1, a1)
             if defect > 0.0:
                 return Attempt(DONE, min(defect, MAX_DEFECT), _factor_after_large_defect(defect, order))
+    elif options[KEEP] == 0.0 and _diverges(series, order, n, x):
+        return Attempt(OUTER_DIVERGED, np.inf, 0.0)
     _evaluate_series(series, unit, order, x, q1, v1, series_a)
     store_prediction(w, q1)
     code = project(f, w, t + h, q1, v1, options[THETA], a1, lam1)
