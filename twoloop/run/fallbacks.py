@@ -162,10 +162,13 @@ LARGEST_RATIO = max(SIZE_RATIOS)
 # if a run comes near a singular position before the time FIRST_STEPS * (longest recent step) has passed, its steps may
 # still be as short as at the start. Then much larger sizes are also tried: LARGE_RATIOS times the size tried first
 FIRST_STEPS = 30.0
-LARGE_RATIOS = tuple(1.2**k for k in range(12, 30))
+LARGE_RATIOS = tuple(1.2**k for k in range(12, 100))
 # "distance" of a state from a singular position: (smallest pivot of C_q there) / (largest value of this pivot in the
 # run). The polynomial across the position should begin at a state with at least the distance FAR_BEFORE
 FAR_BEFORE = 0.2
+# in the first part of a run, this fraction of its time, no state may be far from a singular position: the polynomial
+# then begins at the farthest state
+BESIDE_START = 0.01
 # if no step across a singular position succeeds, the tolerances are multiplied by TOLERANCE_FACTOR, and the longest
 # allowed time between evaluations by GAP_FACTOR (if no forces are short, this time becomes unlimited)
 TOLERANCE_FACTOR, GAP_FACTOR = 10.0, 4.0
@@ -317,6 +320,11 @@ def _limits(run: Run) -> list[Limits]:
     return [Limits(*choice, distance) for choice in choices for distance in NODE_DISTANCES]
 
 
+def is_beside_start(run: Run) -> bool:
+    """Return True if less than the fraction BESIDE_START of the run's time has passed."""
+    return bool(run.clock[run.a.T] - run.t0 < BESIDE_START * (run.t1 - run.t0))
+
+
 def _is_near_start(run: Run) -> bool:
     """Return True if the time since the start is less than FIRST_STEPS times the longest recent step."""
     a, clock = run.a, run.clock
@@ -341,8 +349,8 @@ def _prepare_next_origin(run: Run, plan: Plan, control: Array) -> None:
         control[a.MAX_STEP] = min(run.max_step, run.crossing_tolerances[indices.GAP] / control[a.MAX_EVALUATION_GAP])
     h_long, max_size, time_left = float(clock[a.H_LONG]), float(control[a.MAX_STEP]), run.t1 - float(clock[a.T])
     min_size = time_left if beyond else 0.0
-    if not beyond and control[a.FIXED_STEP] == 0.0:
-        max_size = min(max_size, time_left)
+    if control[a.FIXED_STEP] == 0.0:
+        max_size = min(max_size, LARGEST_RATIO * time_left if beyond else time_left)
     first_size = max(h_long, run.mirrored_size)
     sizes = sizes_across(first_size, max_size, _is_near_start(run))
     run.sizes_to_try = [size for size in sizes if size > min_size and control[a.FIXED_STEP] == 0.0] or sizes[:1]
@@ -371,15 +379,16 @@ def _find_base_state(run: Run, past: list[TimedState]) -> tuple[TimedState | Non
     a, clock, t, n = run.a, run.clock, float(run.clock[run.a.T]), run.system.n_q
 
     farthest = distance_now = distance_from_singular(run, t, run.state[:n])
+    far = 1.0 if is_beside_start(run) else FAR_BEFORE
     base: TimedState | None = None
     size = 0.0
     for time, state in reversed(past):
         distance = distance_from_singular(run, time, state[:n])
-        if (farthest >= FAR_BEFORE and size > 0.0) or distance < MIN_DISTANCE_RATIO * farthest:
+        if (farthest >= far and size > 0.0) or distance < MIN_DISTANCE_RATIO * farthest:
             break
         if distance > farthest:
             size = 2.0 * distance_now * (t - time) / (distance - distance_now)
-            if farthest < FAR_BEFORE:
+            if farthest < far:
                 farthest, base, size = distance, (time, state.copy()), size + t - time
     longest = LARGEST_RATIO * max(float(clock[a.H_LONG]), 0.0 if base is None else t - base[0])
     return base, min(size, longest)
@@ -441,7 +450,11 @@ def handle_crossing(run: Run, plan: Plan, control: Array, code: int, n_accepted:
         if run.attempts_left <= 0:
             run.sizes_to_try, run.origins = [], []
         if clock[a.FAILURE_CODE] not in (indices.SINGULAR, indices.OUTER_DIVERGED):
-            run.sizes_to_try = [size for size in run.sizes_to_try if size < run.crossing_size]
+            # the error is too large: try no larger sizes. But at the start of a run, rounding may have caused this
+            # error, since all nodes are near the position: then still try the much larger sizes of LARGE_RATIOS
+            much_larger = LARGEST_RATIO * max(float(clock[a.H_LONG]), run.mirrored_size)
+            sizes = run.sizes_to_try
+            run.sizes_to_try = [size for size in sizes if size < run.crossing_size or size > much_larger]
         error = float(stored[kernels.ERROR])
         is_worse = run.best_attempt[0] <= error < np.inf
         if GOAL_OF_ERROR < error <= 1.0 and not is_worse and stored[kernels.MAX_ERROR] < 1.0:

@@ -37,6 +37,7 @@ from twoloop.run.fallbacks import (
     crossing_kit,
     distance_from_singular,
     handle_crossing,
+    is_beside_start,
     renew_kit,
     requires_crossing,
     switch_method,
@@ -160,9 +161,6 @@ CROSSING_OVERSHOOT = 100.0  # a crossing step may end beyond t1 by at most this 
 # a run begins again with tighter tolerances if it meets its first singular position in the part EARLY of its time, or
 # after at most FEW_STEPS steps: loose tolerances jump over the first positions unnoticed
 EARLY, FEW_STEPS = 1.0 / 3.0, 32
-# a run that meets a singular position in this part of its time began beside it, and keeps its tolerances up to the next
-# one: rounding errors exceed tighter ones there, and a crossing has no room for its polynomial before the position
-BESIDE_START = 0.01
 NO_KINDS = np.zeros(0, dtype=np.int64)  # kinds of intervals if no states between steps are requested
 # MAX_SPARE: largest number of sets of buffers (times, states, steps of a chunk) kept for later runs. MAX_SPARE_FLOATS:
 # sets whose buffer of states has more floats than this are not kept
@@ -447,10 +445,12 @@ class IntegrationLoop:
                 self.kit = run.kit
 
     def _must_tighten(self) -> bool:
-        """Return whether the run has come near a singular position beside which it did not begin."""
-        a, clock = self.run.a, self.run.clock
-        is_beside_start = clock[a.T] - self.run.t0 < BESIDE_START * (self.t1 - self.run.t0)
-        return self.code in (a.MET_SINGULAR, a.NEAR_SINGULAR) and not is_beside_start
+        """Return whether the run has come near a singular position beside which it did not begin.
+
+        A run that began beside a position keeps its tolerances up to the next one: rounding errors exceed tighter ones
+        there, and a crossing has no room for its polynomial before the position.
+        """
+        return self.code in (self.run.a.MET_SINGULAR, self.run.a.NEAR_SINGULAR) and not is_beside_start(self.run)
 
     def _last_states(self) -> list[TimedState]:
         """Return states at which the polynomial across a singular position may begin; [] if none are recorded."""
@@ -461,7 +461,8 @@ class IntegrationLoop:
             states += zip(t[-N_LAST_STATES:].tolist(), rows[-N_LAST_STATES:], strict=True)
         long = COLLAPSED_STEP * float(self.run.clock[self.run.a.H_LONG])
         ends = [state for before, state in pairwise(states[-N_LAST_STATES:-N_RECENT]) if state[0] - before[0] >= long]
-        return ends[-N_RECENT:] + states[-N_RECENT:]
+        past = ends[-N_RECENT:] + states[-N_RECENT:]
+        return states[:1] + past if is_beside_start(self.run) and past[0] is not states[0] else past
 
     def _correct_last_states(self) -> None:
         """Move the last recorded states, which rounding may have spoiled, onto a polynomial across a singular position.

@@ -265,8 +265,9 @@ def describe_rounding(run: "Run", states: list[TimedState], end: float) -> str:
     system, n = run.system, run.system.n_q
     for t, state in sorted({each[0]: each for each in states}.values(), key=itemgetter(0)):
         q, v = state[:n], state[n : 2 * n]
-        at_singular_start = t == run.t0 and run.starts_singular  # v is given by the user, not changed by rounding
-        if t >= end or at_singular_start or certainly_exceed(run.near_threshold, system.rows(t, q), run.rank):
+        # at a start from which a polynomial leads across the position, v is given by the user, not changed by rounding
+        is_given = t == run.t0 and (run.starts_singular or (run.crossings and run.crossings[0][0][0] == t))
+        if t >= end or is_given or certainly_exceed(run.near_threshold, system.rows(t, q), run.rank):
             continue
         error_ratio = _velocity_error_ratio(run, t, q, v)
         if error_ratio > MAX_LASTING_ERROR:
