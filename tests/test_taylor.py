@@ -126,3 +126,16 @@ def test_a_kink_is_seen_after_the_run_came_near_a_singular_position(compiled):
     result = solve_dae(*start, method="Taylor", rtol=1e-10, atol=1e-10, compiled=compiled)
     assert known.success and result.success
     assert np.abs(result.q[:, -1] - known.q[:, -1]).max() < 1e-8  # 1e-5 where steps after it were not checked
+
+
+@pytest.mark.parametrize(("order", "size"), [(19, 0.1), (6, 0.02)])
+def test_fixed_steps_from_rest_converge_though_the_first_terms_vanish(order, size):
+    """Velocity and acceleration are zero at the start: a comparison with the first terms took this for divergence."""
+    model = PlanarModel(gravity=(0.0, 0.0))
+    model.rod("rod", (0.0, 0.0), (0.0, -1.0), mass=3.0)  # moment of inertia about the pin: 1
+    model.revolute("ground", "rod", at=(0.0, 0.0))
+    model.torque("rod", lambda t, q, v: np.sin(t))
+    problem = model.problem((0.0, 2.0))
+    result = solve_dae(problem.system, problem.t_span, problem.q0, problem.v0, Taylor(order=order), step_size=size)
+    assert result.success, result.message
+    assert abs(result.v[2, -1] - (1.0 - math.cos(2.0))) < 1e-8

@@ -114,7 +114,7 @@ def test_a_cusp_ends_the_run_and_is_named(method):
     assert np.abs(result.q[:, : times.size] - m.states(times)[0]).max() < 1e-6
 
 
-def parallelogram(angle, speed, gravity=-9.81):
+def parallelogram(angle, speed, gravity=-9.81, torque=None):
     """Two cranks with a coupler that stays level; it may turn where all lie in line."""
     model, base = PlanarModel(gravity=(0.0, gravity)), np.array([2.0, 0.0])
     tip = np.array([np.cos(angle), np.sin(angle)])
@@ -124,6 +124,8 @@ def parallelogram(angle, speed, gravity=-9.81):
     bodies, pins = ("ground", "crank", "coupler", "rocker"), ((0.0, 0.0), tip, tip + base, base)
     for k in range(4):
         model.revolute(bodies[k], bodies[k - 3], at=pins[k])
+    if torque is not None:
+        model.torque("crank", torque)
     return model.problem((0.0, 30.0))
 
 
@@ -169,6 +171,16 @@ def test_a_run_that_begins_shortly_before_a_singular_position_crosses_it(angle, 
     exact = solve_ivp(one, (0.0, end), (angle, speed), "DOP853", **strict).y[0, -1]
     assert result.success, result.message
     assert abs(result.q[2, -1] - exact) < 100.0 * tolerance and abs(result.q[5, -1]) < 100.0 * tolerance
+
+
+@pytest.mark.parametrize("tolerance", [1e-6, slow(1e-8), 1e-10])
+def test_a_polynomial_from_the_start_does_not_lose_a_gust_that_steps_have_met(tolerance):
+    """Steps resolved the gust; the polynomial across the position began before it, and had no node in it."""
+    inertia, width, torque = 2.0 / 3.0 + 1.5, 2e-4, -5000.0
+    problem = parallelogram(-0.03, 3.0, 0.0, lambda t, q, v: torque * np.exp(-(((t - 0.006) / width) ** 2)))
+    result = solve_dae(problem.system, (0.0, 10.0), problem.q0, problem.v0, rtol=tolerance, atol=tolerance)
+    assert result.success, result.message
+    assert abs(result.v[2, -1] - 3.0 - torque * width * np.sqrt(np.pi) / inertia) < 300.0 * tolerance
 
 
 @pytest.mark.filterwarnings("ignore:the constraints of:twoloop.ConstraintWarning")

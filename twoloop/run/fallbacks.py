@@ -162,7 +162,7 @@ LARGEST_RATIO = max(SIZE_RATIOS)
 # if a run comes near a singular position before the time FIRST_STEPS * (longest recent step) has passed, its steps may
 # still be as short as at the start. Then much larger sizes are also tried: LARGE_RATIOS times the size tried first
 FIRST_STEPS = 30.0
-LARGE_RATIOS = tuple(1.2**k for k in range(12, 100))
+LARGE_RATIOS = (*(1.2**k for k in range(12, 30)), *(1.44**k for k in range(15, 50)))
 # "distance" of a state from a singular position: (smallest pivot of C_q there) / (largest value of this pivot in the
 # run). The polynomial across the position should begin at a state with at least the distance FAR_BEFORE
 FAR_BEFORE = 0.2
@@ -352,7 +352,7 @@ def _prepare_next_origin(run: Run, plan: Plan, control: Array) -> None:
     if control[a.FIXED_STEP] == 0.0:
         max_size = min(max_size, LARGEST_RATIO * time_left if beyond else time_left)
     first_size = max(h_long, run.mirrored_size)
-    sizes = sizes_across(first_size, max_size, _is_near_start(run))
+    sizes = sizes_across(first_size, max_size, limits.node_distance == 1.0 and _is_near_start(run))
     run.sizes_to_try = [size for size in sizes if size > min_size and control[a.FIXED_STEP] == 0.0] or sizes[:1]
     clock[a.H_NEXT], clock[a.H_LIMIT] = run.sizes_to_try.pop(0), np.inf
     run.crossing_size = float(clock[a.H_NEXT])

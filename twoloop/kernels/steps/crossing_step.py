@@ -19,7 +19,7 @@ motion, and the fixed-point iteration converges as it does elsewhere.
 
 import numpy as np
 
-from twoloop.kernels.control.singular_positions import MAX_NEAR_RATIO, MIN_NEAR_RATIO, near_pivot_ratio
+from twoloop.kernels.control.singular_positions import EPS, MAX_NEAR_RATIO, MIN_NEAR_RATIO, near_pivot_ratio
 from twoloop.kernels.control.step_size import commit_nothing, store_prediction
 from twoloop.kernels.data.common import ATTEMPT, Attempt, Step, allowed_error, compiled, kernel, merged
 from twoloop.kernels.data.indices import ATOL, DONE, ESTIMATE, GAP, OUTER_DIVERGED, RTOL, SINGULAR
@@ -59,6 +59,8 @@ LATE = S - 4  # node near a polynomial's end: if its pivot exceeds the end's, th
 # an attempt that computes a polynomial returns this as error and as step-size factor. So the step is repeated; it then
 # follows the polynomial
 REPEAT_FACTOR = 2.0
+# a polynomial from an earlier state must reach the present one within this number of tolerances or rounding errors
+MAX_DEVIATION = 100.0
 TINY = 1e-300  # lower bound of divisors that may be zero
 
 
@@ -241,6 +243,25 @@ def _polynomial_at(time, duration, b, c, a, q_0, v_0, weights_v, weights_q, q, v
         q[m] = q_0[m] + duration * (fraction * v_0[m] + duration * q[m])
         v[m] = v_0[m] + duration * v[m]
     _interpolate(fraction, c, range(S), a, acceleration)
+
+
+@merged
+def _deviates(tolerances, pivot_ratio, q, v, q_reached, v_reached):
+    """Return True if a polynomial misses the present state (q, v), as short forces act before it, between its nodes.
+
+    (q_reached, v_reached): state on the polynomial; rounding errors of v are about EPS / pivot_ratio^2, relative to v.
+    """
+    fastest = 0.0
+    for m in range(v.size):
+        fastest = max(fastest, abs(v[m]))
+    rounding = EPS / (pivot_ratio * pivot_ratio) * fastest
+    for m in range(v.size):
+        atol, rtol = tolerances[ATOL + m], tolerances[RTOL]
+        if not abs(v_reached[m] - v[m]) <= MAX_DEVIATION * max(rounding, atol + rtol * abs(v[m])):
+            return True
+        if not abs(q_reached[m] - q[m]) <= MAX_DEVIATION * max(rounding, atol + rtol * abs(q[m])):
+            return True
+    return False
 
 
 @merged
@@ -429,6 +450,12 @@ def crossing_step(f, w, options, memory, t, h, tolerances, state, new_state):
         if not error <= stored[MAX_ERROR]:
             return Attempt(DONE, max(error, REPEAT_FACTOR), 0.0)
     _set_beginning_state(duration, c_base, weights_v, weights_q, a, q_base, v_base, q_0, v_0)
+    if is_estimated and t_base < t:
+        code = renew_partition(f, w, t, q)
+        _polynomial_at(t - begin, duration, b, c, a, q_0, v_0, weights_v, weights_q, q_stage, v_stage, a_stage)
+        ratio = max(w.pivot / largest_pivot, EPS)
+        if code != DONE or _deviates(tolerances, ratio, q, v, q_stage, v_stage):
+            return Attempt(OUTER_DIVERGED, np.inf, 0.0)
     # a step of fixed size ends where it must, even if this is nearer to the singular position than its beginning
     min_pivots = MIN_PIVOT_RATIO * pivot if is_estimated else 0.0, min_node_pivot * largest_pivot
     code = _choose_partition_at_end(f, w, t + h, duration, stored, *min_pivots, tables, a, *states)

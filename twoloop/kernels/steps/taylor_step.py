@@ -393,8 +393,7 @@ NEAR_BEGIN = 1e-5  # time from the beginning of a step to a state where the seri
 GOLDEN_SECTION = 0.6180339887498949
 MAX_DEFECT = 1e300  # replaces an infinite defect, which means that a callback had no finite value: the step is rejected
 MIN_FACTOR = 0.1  # smallest ratio of the next step size to the size of a step rejected because of its defect
-# a step of fixed size fails if the last term of the velocities' series is above this fraction of the first two terms
-MAX_LAST_TERM = 0.01
+MAX_RISE = 4.0  # a step of fixed size fails if terms of its series rise by more than this factor, see `_diverges`
 MAX_GROWTH = 5.0  # largest ratio of successive step sizes, because coefficients are scaled by the previous step size
 MAX_FIRST_FACTOR = 1e6  # largest ratio of the first step size to its guess, so that powers of the ratio do not overflow
 TOO_SHORT = 2.0  # error returned for a first step much shorter than its series allows; above 1, so that it is repeated
@@ -433,13 +432,28 @@ def _max_step(tolerances, series, unit, order, n):
 
 
 @compiled
-def _diverges(series, order, n, x):
-    """Return True if the last term of the velocities after x units is above MAX_LAST_TERM of the first two terms."""
-    first, last = 0.0, 0.0
+def _diverges(tolerances, series, order, n, x):
+    """Return True if a coordinate's series, evaluated after x units of time, grows again in its last two terms.
+
+    Beside a singular position, rounding errors of C_q's solutions grow from each order to the next. A coordinate's term
+    is compared in pairs of successive orders, as every other one may vanish. Its largest pair of terms and the pairs
+    after it would decrease if the series converged. Growth below the tolerances is harmless.
+    """
     for j in range(n):
-        first = max(first, abs(series[n + j]), abs(2.0 * x * series[2 * n + j]))
-        last = max(last, abs(series[order * n + j]))
-    return not order * x ** (order - 1) * last <= MAX_LAST_TERM * first
+        peak = least = last = before = 0.0
+        power = 1.0
+        for k in range(1, order + 1):
+            term = k * power * abs(series[k * n + j])
+            last, before = max(before, term), term
+            power *= x
+            if 1 < k < order:
+                if last >= peak:
+                    peak = least = last
+                least = min(least, last)
+        is_harmless = x * last <= tolerances[ATOL + j] + tolerances[RTOL] * abs(series[j])
+        if 0.0 < MAX_RISE * least < last and not is_harmless:
+            return True
+    return False
 
 
 @merged
@@ -580,7 +594,7 @@ def taylor_step(f, w, options, memory, t, h, tolerances, state, new_state):
             defect = _first_large_defect(f, w, memory, t, h, tolerances, series, order, q1, v1, a1)
             if defect > 0.0:
                 return Attempt(DONE, min(defect, MAX_DEFECT), _factor_after_large_defect(defect, order))
-    elif options[KEEP] == 0.0 and _diverges(series, order, n, x):
+    elif options[KEEP] == 0.0 and _diverges(tolerances, series, order, n, x):
         return Attempt(OUTER_DIVERGED, np.inf, 0.0)
     _evaluate_series(series, unit, order, x, q1, v1, series_a)
     store_prediction(w, q1)
