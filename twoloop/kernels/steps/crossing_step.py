@@ -59,8 +59,9 @@ LATE = S - 4  # node near a polynomial's end: if its pivot exceeds the end's, th
 # an attempt that computes a polynomial returns this as error and as step-size factor. So the step is repeated; it then
 # follows the polynomial
 REPEAT_FACTOR = 2.0
-# a polynomial from an earlier state must reach the present one within this number of tolerances or rounding errors
-MAX_DEVIATION = 100.0
+# a polynomial from an earlier state must reach the present one within MAX_DEVIATION tolerances, or within the error that
+# rounding may have caused in velocities, ROUNDING_FACTOR * EPS / (ratio of pivots)^2
+MAX_DEVIATION, ROUNDING_FACTOR = 1e3, 1e5
 TINY = 1e-300  # lower bound of divisors that may be zero
 
 
@@ -249,17 +250,17 @@ def _polynomial_at(time, duration, b, c, a, q_0, v_0, weights_v, weights_q, q, v
 def _deviates(tolerances, pivot_ratio, q, v, q_reached, v_reached):
     """Return True if a polynomial misses the present state (q, v), as short forces act before it, between its nodes.
 
-    (q_reached, v_reached): state on the polynomial; rounding errors of v are about EPS / pivot_ratio^2, relative to v.
+    (q_reached, v_reached): state on the polynomial.
     """
     fastest = 0.0
     for m in range(v.size):
         fastest = max(fastest, abs(v[m]))
-    rounding = EPS / (pivot_ratio * pivot_ratio) * fastest
+    rounding = ROUNDING_FACTOR * EPS / (pivot_ratio * pivot_ratio) * fastest
     for m in range(v.size):
         atol, rtol = tolerances[ATOL + m], tolerances[RTOL]
-        if not abs(v_reached[m] - v[m]) <= MAX_DEVIATION * max(rounding, atol + rtol * abs(v[m])):
+        if not abs(v_reached[m] - v[m]) <= max(rounding, MAX_DEVIATION * (atol + rtol * abs(v[m]))):
             return True
-        if not abs(q_reached[m] - q[m]) <= MAX_DEVIATION * max(rounding, atol + rtol * abs(q[m])):
+        if not abs(q_reached[m] - q[m]) <= max(rounding, MAX_DEVIATION * (atol + rtol * abs(q[m]))):
             return True
     return False
 
