@@ -59,8 +59,8 @@ LATE = S - 4  # node near a polynomial's end: if its pivot exceeds the end's, th
 # an attempt that computes a polynomial returns this as error and as step-size factor. So the step is repeated; it then
 # follows the polynomial
 REPEAT_FACTOR = 2.0
-# a polynomial from an earlier state must reach the present one within MAX_DEVIATION tolerances, or within the error that
-# rounding may have caused in velocities, ROUNDING_FACTOR * EPS / (ratio of pivots)^2
+# a polynomial from an earlier state must reach the present one within MAX_DEVIATION tolerances, or within the error
+# that rounding may have caused in velocities, ROUNDING_FACTOR * EPS / (ratio of pivots)^2
 MAX_DEVIATION, ROUNDING_FACTOR = 1e3, 1e5
 TINY = 1e-300  # lower bound of divisors that may be zero
 
