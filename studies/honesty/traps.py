@@ -335,6 +335,7 @@ def rung(work: Callable[..., Any], after: float, *run: Any, **options: Any) -> A
     except Rung:
         error = 0.0
     finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)  # a signal without a handler would end this process later
         signal.signal(signal.SIGALRM, before)
     return SimpleNamespace(status=Status.REACHED_END, message="", success=True, error=error)
 
