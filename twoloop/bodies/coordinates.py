@@ -11,8 +11,7 @@ import numpy as np
 from twoloop.bodies.collection import Collection
 from twoloop.bodies.frames import angle_of, point_of, vector_of
 from twoloop.bodies.parts import ModelJoint, Numbers
-from twoloop.bodies.rotation import euler_parameters
-from twoloop.bodies.rotation_rates import Components, euler_product, parameters_of, rate_of_vector, spin_of
+from twoloop.bodies.rotation import Components, euler_parameters, euler_product, parameters_of, rate_of_vector, spin_of
 from twoloop.checks.arguments import Array, shown
 
 TURN = 2.0 * np.pi

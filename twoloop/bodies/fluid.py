@@ -19,7 +19,7 @@ import numpy as np
 from twoloop.bodies.file_parts import Lump
 from twoloop.bodies.frames import vector_of
 from twoloop.bodies.parts import Body
-from twoloop.bodies.rotation_rates import rate_of_vector, spin_of
+from twoloop.bodies.rotation import rate_of_vector, spin_of
 from twoloop.bodies.tendons import smooth_size
 
 ROUNDED = 1e-8  # below this rate, m/s or rad/s, |v| v is smoothed without a branch; it changes by less than 1e-16

@@ -16,7 +16,7 @@ from scipy.linalg import null_space
 from twoloop.bodies.coordinates import TURN, JointCoordinate, velocity_apart
 from twoloop.bodies.frames import angle_of, point_of
 from twoloop.bodies.parts import ModelJoint
-from twoloop.bodies.rotation_rates import cross, spin_of
+from twoloop.bodies.rotation import cross, spin_of
 from twoloop.bodies.spanning_tree import SpanningTree
 from twoloop.checks.arguments import Array
 from twoloop.problem.system import ConstrainedSystem

@@ -28,8 +28,14 @@ from twoloop.bodies.frames import vector_of
 from twoloop.bodies.mjcf_actuators import FILTERS, TendonsAndActuators, activation_of, is_single, trimmed
 from twoloop.bodies.parameter_layout import HINGE_ROTOR, SLIDE_ROTOR
 from twoloop.bodies.parts import Body, Force, ModelJoint, Numbers
-from twoloop.bodies.rotation import euler_parameters, rotation_matrix
-from twoloop.bodies.rotation_rates import euler_product, parameters_of, rate_of_vector, spin_of
+from twoloop.bodies.rotation import (
+    euler_parameters,
+    euler_product,
+    parameters_of,
+    rate_of_vector,
+    rotation_matrix,
+    spin_of,
+)
 from twoloop.bodies.tendons import SpringTension
 from twoloop.checks.arguments import Array, shown
 

@@ -14,7 +14,7 @@ from twoloop.bodies.frames import point_of
 from twoloop.bodies.functions import n_arguments
 from twoloop.bodies.loads import CoordinateGap, Loads, Row, function_rows
 from twoloop.bodies.parts import COINCIDE, Body, ModelJoint, Numbers
-from twoloop.bodies.rotation_rates import in_body_axes
+from twoloop.bodies.rotation import in_body_axes
 from twoloop.bodies.tendons import SpringTension, Tendon, prescribed_tension
 from twoloop.checks.arguments import check_finite, check_not_negative, check_positive, shown
 from twoloop.problem.description import Stop

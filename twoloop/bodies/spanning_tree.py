@@ -16,8 +16,7 @@ import numpy as np
 
 from twoloop.bodies.frames import GROUND
 from twoloop.bodies.parts import ModelJoint, Numbers
-from twoloop.bodies.rotation import euler_parameters
-from twoloop.bodies.rotation_rates import euler_product, rotated_by
+from twoloop.bodies.rotation import euler_parameters, euler_product, rotated_by
 from twoloop.checks.arguments import Array
 
 TURN = 2.0 * np.pi

@@ -35,8 +35,7 @@ from twoloop.bodies.loads import function_rows
 from twoloop.bodies.mjcf_loads import couple
 from twoloop.bodies.parameter_layout import POINT
 from twoloop.bodies.parts import Body, JointRow, ModelJoint, Numbers
-from twoloop.bodies.rotation import euler_parameters, perpendiculars
-from twoloop.bodies.rotation_rates import euler_product, parameters_of
+from twoloop.bodies.rotation import euler_parameters, euler_product, parameters_of, perpendiculars
 from twoloop.bodies.spatial.model import SpatialModel
 from twoloop.checks.arguments import Array, check_choice, check_finite, check_flag, check_path, check_vector
 

@@ -17,8 +17,7 @@ from twoloop.bodies.loads import Row, function_rows, listed
 from twoloop.bodies.model_problem import Model
 from twoloop.bodies.parameter_layout import RATE_FUNCTION, ROW_FUNCTION
 from twoloop.bodies.parts import Body, JointRow, ModelJoint, Numbers
-from twoloop.bodies.rotation import euler_parameters, perpendiculars
-from twoloop.bodies.rotation_rates import cross, euler_product, spin_of
+from twoloop.bodies.rotation import cross, euler_parameters, euler_product, perpendiculars, spin_of
 from twoloop.checks.arguments import Array, check_positive, check_vector
 
 MOST_TEETH = 1000  # largest numerator and denominator of a gear ratio
