@@ -104,6 +104,14 @@ def test_a_stored_state_that_was_altered(default_four_bar):
         assert result.t[k] - 0.11 <= refused(replace(result, v=v)).t <= result.t[k]
 
 
+@pytest.mark.parametrize("shift", [-0.01, 2e-4, 0.01])
+def test_times_that_are_not_those_of_the_dense_solution(default_four_bar, shift):
+    result = run(default_four_bar, 1.0, dense_output=True)
+    assert silently(result)
+    faults = refused(replace(result, t=result.t + shift)).faults
+    assert any("the dense solution goes from t = 0 to 1, and the result from" in fault for fault in faults)
+
+
 def test_constant_steps_are_measured_by_the_tolerance_that_is_asked_for(default_four_bar):
     result = run(default_four_bar, 1.0, method="Gauss4", step_size=0.05)
     refused(result)  # of 1e-8, which no step was held to

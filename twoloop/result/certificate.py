@@ -361,7 +361,7 @@ class _Checker:
     def _deviation_between(self, state: Array, i: int, j: int) -> float:
         """Return the deviation of the dense solution from a reintegrated state, divided by the tolerance."""
         t = self._check_time(i, j)
-        if self.sol is None or not self.t[i] < t < self.t[j]:
+        if self.sol is None or not (self.t[i] < t < self.t[j] and self.sol.t_min <= t <= self.sol.t_max):
             return 0.0
         table = self.sol.table
         # in intervals of this kind, interpolation is less accurate than the states

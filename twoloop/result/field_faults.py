@@ -76,6 +76,10 @@ def _times_and_steps(result: Record) -> Iterator[str]:
         yield "the sizes of the steps, h, are not all positive numbers"
     elif len(h) and h.sum() < duration * (1.0 - NEAR):
         yield f"the steps, h, add up to {h.sum():.6g} s, and the result covers {duration:.6g} s"
+    sol, largest = result.sol, max(duration, abs(float(t[0])), abs(float(t[-1])))
+    if sol is not None and min(t[0] - sol.t_min, sol.t_max - t[-1]) < -NEAR * largest:
+        limits = f"t = {sol.t_min:.6g} to {sol.t_max:.6g}"
+        yield f"the dense solution goes from {limits}, and the result from {t[0]:.6g} to {t[-1]:.6g}"
     n_accepted = result.stats.n_accepted
     if len(h) and n_accepted is not None and n_accepted != len(h):
         yield f"stats counts {n_accepted} accepted steps, and h has {len(h)}"
