@@ -305,6 +305,24 @@ def test_memory_that_shows_along_the_motion_is_named_at_its_end(make):
     assert result.status is Status.WRONG_TRACE and "when it is called again" in result.message
 
 
+@pytest.mark.parametrize("kind", ["mass", "constraint", "jacobian", "gamma", "force"])
+@pytest.mark.parametrize("method", ["DOP853", "RadauIIA9"])
+def test_any_callback_that_changes_once_is_named(kind, method):
+    calls = itertools.count()
+    functions = {
+        "mass": lambda t, q: np.eye(2),
+        "constraint": lambda t, q: np.array([q @ q - 1.0]),
+        "jacobian": lambda t, q: 2.0 * q[None, :],
+        "gamma": lambda t, q, v: np.array([-2.0 * v @ v]),
+        "force": lambda t, q, v: np.array([0.0, -9.81]),
+    }
+    changing = functions[kind]
+    functions[kind] = lambda *arguments: changing(*arguments) + (0.0 if next(calls) < 60 else 1e-4)
+    system = ConstrainedSystem.from_python(n_q=2, n_c=1, **functions)
+    result = solve_dae(system, (0.0, 1.0), [0.8, -0.6], [0.0, 0.0], method, rtol=1e-6, atol=1e-6)
+    assert result.status is Status.WRONG_TRACE and f"{kind} of 'system' gives something else" in result.message
+
+
 @callback("force")
 def throws_dice(t, q, v, p, Q):
     Q[0] = np.random.random()  # noqa: NPY002

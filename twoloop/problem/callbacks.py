@@ -153,6 +153,7 @@ KIND_NAMES = tuple(KINDS)
 _ARRAYS: dict[Address, Array] = {}  # cached arrays by address and shape: the arrays of a run do not move
 MAX_ARRAYS = 1000  # largest number of cached arrays
 REAL_DTYPES = "fiu"  # kinds of real dtypes; durations, which NumPy counts as integers, are excluded
+MAX_SAMPLED = 10_000  # largest number of entries of a value that is stored to be compared at the end of a run
 HANDLE_BITS = 52  # random bits of a handle: a float64 represents it exactly, and two processes get different handles
 
 
@@ -173,9 +174,9 @@ class PythonFunctions:
 
     def restart(self) -> None:
         """Discard the samples, at the beginning of a run."""
-        # (arguments, value) of a few calls of force, each 1.25 times as late as the last: repeated at the end of a run
-        self.samples: list[tuple[tuple[Any, ...], Any]] = []
-        self.n_calls, self._next = 0, 1  # n_calls: number of calls of force
+        # (arguments, value) of a few calls, each 1.25 times as late as the last: repeated at the end of a run
+        self.samples: dict[str, list[tuple[tuple[Any, ...], Any]]] = {kind: [] for kind in self.functions}
+        self.n_calls, self._next = dict.fromkeys(self.functions, 0), dict.fromkeys(self.functions, 1)
 
     def call(self, kind: str, arguments: tuple[Any, ...], p: Address, out: Array) -> None:
         """Call one function with copies of the arrays, check the returned value and write it to `out`."""
@@ -188,11 +189,10 @@ class PythonFunctions:
             error.add_note(f"raised by {kind} of system {self.name!r} at t = {t!r}")
             raise
         store(kind, self.name, t, value, out)
-        if kind == "force":
-            self.n_calls += 1
-            if self.n_calls == self._next:
-                self._next += 1 + self._next // 4
-                self.samples.append((tuple(np.copy(each) for each in arguments), out.copy()))
+        self.n_calls[kind] += 1
+        if self.n_calls[kind] == self._next[kind] and out.size <= MAX_SAMPLED:
+            self._next[kind] += 1 + self._next[kind] // 4
+            self.samples[kind].append((tuple(np.copy(each) for each in arguments), out.copy()))
 
 
 def store(kind: str, name: str, t: float, value: Any, out: Array) -> None:

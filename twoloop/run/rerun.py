@@ -15,6 +15,7 @@ from twoloop.checks.derivatives import wrong_derivative
 from twoloop.checks.structure import run_inconsistency
 from twoloop.generate.derived_callbacks import exact_derivatives, generic_states
 from twoloop.generate.traced_values import CLEAR_DIFFERENCE, MAX_STATES_IN_PYTHON, CheckedRegion
+from twoloop.kernels.compile.callbacks import KINDS
 from twoloop.kernels.data import indices
 from twoloop.methods import dop853
 from twoloop.methods.dop853 import DOP853
@@ -64,7 +65,7 @@ def check_callbacks_along_run(
     Otherwise, states are chosen from those rows of `states(False)` that are outside this region; no states are compared
     if `is_inside` (the whole run is inside the region), or if `end` <= run.compared_until[0].
     """
-    if changed := describe_changed_force(run):
+    if changed := describe_changed_value(run):
         return Status.WRONG_TRACE, f"{changed} {message}"
     region, parameters, old_status = checked_region_of(run, check_derivatives), run.varied_parameters, status
     all_states = is_due or (parameters is not None and not region.contains_parameters(parameters))
@@ -130,7 +131,9 @@ def find_nondeterminism(system: ConstrainedSystem, states: Array) -> str | None:
     if not differences.max() > CLEAR_DIFFERENCE * np.abs(first_forces[comparable]).max(initial=0.0):
         return None
     k, entry = np.unravel_index(differences.argmax(), differences.shape)
-    return _change_text(system.name, float(states[k, 0]), int(entry), first_forces[k, entry], second_forces[k, entry])
+    return _change_text(
+        system.name, "force", float(states[k, 0]), int(entry), first_forces[k, entry], second_forces[k, entry]
+    )
 
 
 def python_functions(system: ConstrainedSystem) -> PythonFunctions | None:
@@ -139,7 +142,7 @@ def python_functions(system: ConstrainedSystem) -> PythonFunctions | None:
 
 
 def first_force(system: ConstrainedSystem, t0: float, q0: Array, v0: Array) -> tuple[Any, Array] | None:
-    """Return ((t0, q0, v0), value of the compiled force) for `describe_changed_force`; None if the force fails.
+    """Return ((t0, q0, v0), value of the compiled force) for `describe_changed_value`; None if the force fails.
 
     If callbacks are called in Python, the run will record calls of the force: discard older records, and return None.
     """
@@ -151,38 +154,54 @@ def first_force(system: ConstrainedSystem, t0: float, q0: Array, v0: Array) -> t
     return None
 
 
-def describe_changed_force(run: Run) -> str | None:
-    """Repeat calls of the force that were recorded before or in a run; describe a changed value, or return None.
+def describe_changed_value(run: Run) -> str | None:
+    """Repeat calls of callbacks that were recorded before or in a run; describe a changed value, or return None.
 
-    Two calls after the run would not reveal a force that changes slowly (with the clock) or once (after 1000 calls).
+    Two calls after the run would not reveal a value that changes slowly (with the clock) or once (after 1000 calls).
     """
     system, functions = run.system, python_functions(run.system)
-    if functions is None:
-        samples, force, n_repeated = system.derived.get(FIRST_FORCE, []), system.force, 1
-    else:
-        samples, force = functions.samples.copy(), functions.functions["force"]
-        n_repeated = max(len(samples), min(MAX_REPEATED, functions.n_calls // CALLS_PER_REPETITION))
-    if not samples or run.control[run.a.FIXED_STEP] != 0.0:
+    if run.control[run.a.FIXED_STEP] != 0.0:
         return None
+    if functions is None:
+        return _changed_value(run, "force", system.force, system.derived.get(FIRST_FORCE, []), 1)
+    for kind, samples in functions.samples.items():
+        wanted = min(MAX_REPEATED, functions.n_calls[kind] // CALLS_PER_REPETITION) if kind == "force" else 0
+        n_repeated = max(len(samples), wanted)
+        if samples and (text := _changed_value(run, kind, functions.functions[kind], samples, n_repeated)):
+            return text
+    return None
+
+
+def _changed_value(
+    run: Run, kind: str, function: Callable[..., Any], samples: list[Any], n_repeated: int
+) -> str | None:
+    """Repeat calls of a callback, `samples` of (arguments, value) in turn; describe a changed value, or return None.
+
+    Constraints are zero up to rounding, which may differ: a changed one must displace a coordinate by the tolerance.
+    """
+    system = run.system
     with warnings.catch_warnings(), np.errstate(all="ignore"):
         warnings.simplefilter("ignore")
         for arguments, value in islice(cycle(samples), n_repeated):
             try:
-                new_value = np.asarray(force(float(arguments[0]), *map(np.copy, arguments[1:])))
-            except Exception:  # the state is outside the domain of the force
+                new_value = np.asarray(function(float(arguments[0]), *map(np.copy, arguments[1:])))
+            except Exception:  # the state is outside the domain of the function
                 continue
             comparable = np.isfinite(value) & np.isfinite(new_value)
-            differences = np.abs(np.subtract(value, new_value, out=np.zeros(len(value)), where=comparable))
+            differences = np.abs(np.subtract(value, new_value, out=np.zeros_like(value), where=comparable))
             if differences.max(initial=0.0) > CLEAR_DIFFERENCE * np.abs(value[comparable]).max(initial=0.0):
-                entry = int(differences.argmax())
-                t = float(arguments[0])
-                return f"In the run {_change_text(system.name, t, entry, value[entry], new_value[entry])}."
+                k, t, q = int(differences.argmax()), float(arguments[0]), arguments[1]
+                least = run.tolerances[indices.LEAST] * max(1.0, np.abs(q).max())
+                if kind == "constraint" and differences.max() <= least * np.abs(system.jacobian(t, q)).max():
+                    continue
+                return f"In the run {_change_text(system.name, kind, t, k, value.flat[k], new_value.flat[k])}."
     return None
 
 
-def _change_text(name: str, t: float, entry: int, first_value: float, second_value: float) -> str:
+def _change_text(name: str, kind: str, t: float, entry: int, first_value: float, second_value: float) -> str:
+    state = "t, q and v" if len(KINDS[kind].state) > 1 else "t and q"
     return (
-        f"force of {name!r} gives something else when it is called again with the same t, q and v: at "
+        f"{kind} of {name!r} gives something else when it is called again with the same {state}: at "
         f"t = {t:.10g} entry {entry} is {first_value:.9g}, and then {second_value:.9g}. It must "
         "depend on its arguments alone: steps are tried, rejected and sampled in advance"
     )
