@@ -1,4 +1,4 @@
-"""Rotate by Euler parameters e = (e0, e1, e2, e3): helpers of compiled callbacks, then functions for symbols as well.
+"""Rotate by Euler parameters e = (e0, e1, e2, e3): compiled helpers, then functions that also take symbols.
 
 R(e) a = (e0^2 - f.f) a + 2 f (f.a) + 2 e0 f x a with f = (e1, e2, e3) is quadratic in e. So the acceleration of
 a body-fixed vector for e'' = 0 is twice R(e') a. See Nikravesh, Computer-Aided Analysis of Mechanical

@@ -235,8 +235,7 @@ class PivotChooser:
         if n_independent == 0:
             return PivotChoice((), (), (), 0.0)
         if index < 0:
-            stays = "is nearly singular even with constraints added"
-            defect = stays if index == STAYS_SINGULAR else "is too close to singular"
+            defect = f"is nearly singular{' even with constraints added' * (index == STAYS_SINGULAR)}"
             raise Untraceable(f"the mass of {system.name!r} {defect}")
         if n_added == 0:
             system.derived["no weak mass"] = True

@@ -174,7 +174,7 @@ class PythonFunctions:
 
     def restart(self) -> None:
         """Discard the samples, at the beginning of a run."""
-        # (arguments, value) of a few calls, each 1.25 times as late as the last: repeated at the end of a run
+        # (arguments, value) of a few calls of each kind, each 1.25 times as late as the last: repeated after a run
         self.samples: dict[str, list[tuple[tuple[Any, ...], Any]]] = {kind: [] for kind in self.functions}
         self.n_calls, self._next = dict.fromkeys(self.functions, 0), dict.fromkeys(self.functions, 1)
 
